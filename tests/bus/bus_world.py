@@ -1,0 +1,48 @@
+"""What the tests of the bus share: devices to publish, questions without our client, waiting."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+
+import zenoh
+
+from vad.bus import messages as m
+from vad.bus.session import BusSettings, open_session
+
+ROOT = Path(__file__).parents[2]
+
+
+def mac(i: int) -> str:
+    return f"aa:bb:cc:dd:{i >> 8:02x}:{i & 255:02x}"
+
+
+def device(i: int = 0, **changes: object) -> m.DeviceMessage:
+    fields: dict[str, object] = {
+        "source": "simulated",
+        "mac": mac(i),
+        "state": "mapped",
+        "x_m": float(i),
+        "y_m": 1.0,
+        "covariance_m2": ((0.01, 0.0), (0.0, 0.01 * (i + 1))),
+        "radius90_m": 0.3,
+        "room": "Kitchen" if i % 2 else "Living room",
+    }
+    return m.DeviceMessage(**(fields | changes))  # type: ignore[arg-type]
+
+
+def settings(endpoint: str, hub: str = "home") -> BusSettings:
+    return BusSettings(hub=hub, listen=(endpoint,))
+
+
+def ask_raw(endpoint: str, selector: str) -> list[zenoh.Reply]:
+    with open_session(BusSettings(mode="client", connect=(endpoint,))) as session:
+        return list(session.get(selector, target=zenoh.QueryTarget.ALL, timeout=5.0))
+
+
+async def until(condition: Callable[[], bool], what: str, timeout_s: float = 10.0) -> None:
+    async with asyncio.timeout(timeout_s):
+        while not condition():  # noqa: ASYNC110 - zenoh's side has no asyncio event to wait for
+            await asyncio.sleep(0.01)
+    assert condition(), what

@@ -1,0 +1,135 @@
+"""The V4L2 adapter with a capture device that answers as OpenCV's does: stamps, unplug, replug, the end."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from vad.camera.frame import Frame
+from vad.camera.v4l2 import V4l2Camera, V4l2Settings, open_v4l2
+from vad.errors import SourceError
+from vad.streams import DropOldestQueue
+
+
+class Device:
+    """A camera on the bus that can be unplugged; one `Handle` per opening, as cv2.VideoCapture is one."""
+
+    def __init__(self, stamp_ms: Callable[[], float]) -> None:
+        self.stamp_ms = stamp_ms
+        self.plugged = threading.Event()
+        self.plugged.set()
+        self.settings: list[tuple[int, float]] = []
+        self.open_handles = 0
+
+    def open(self, device: str) -> Handle:
+        if not self.plugged.is_set():
+            raise SourceError("there is no such camera", where=device)
+        self.open_handles += 1
+        return Handle(self)
+
+
+class Handle:
+    def __init__(self, device: Device) -> None:
+        self.device = device
+        self.tick = threading.Event()
+
+    def isOpened(self) -> bool:  # noqa: N802
+        return True
+
+    def read(self) -> tuple[bool, Any]:
+        self.tick.wait(0.005)
+        good = self.device.plugged.is_set()
+        return good, np.full((48, 64, 3), 9, np.uint8) if good else None
+
+    def get(self, prop: int, /) -> float:
+        assert prop == cv2.CAP_PROP_POS_MSEC
+        return self.device.stamp_ms()
+
+    def set(self, prop: int, value: float, /) -> bool:
+        self.device.settings.append((prop, value))
+        return True
+
+    def release(self) -> None:
+        self.device.open_handles -= 1
+
+
+def monotonic_ms() -> float:
+    return time.monotonic_ns() * 1e-6
+
+
+async def until(condition: Callable[[], bool], timeout_s: float = 5.0) -> None:
+    async with asyncio.timeout(timeout_s):
+        while not condition():  # noqa: ASYNC110
+            await asyncio.sleep(0.005)
+
+
+async def test_driver_stamps_unplug_and_replug() -> None:
+    device = Device(lambda: monotonic_ms() - 30.0)
+    camera = V4l2Camera(V4l2Settings("/dev/video9", 64, 48, 30.0), opener=device.open)
+    out: DropOldestQueue[Frame] = DropOldestQueue(1000)
+    task = asyncio.create_task(camera.run(out))
+    await until(lambda: len(out) >= 3)
+    frame = out.drain()[-1]
+    assert 25_000_000 < time.monotonic_ns() - frame.t_ns < 2_000_000_000
+    assert camera.health.detail == "64x48, stamps: driver"
+    assert device.settings[0] == (cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG"))
+    assert (cv2.CAP_PROP_FRAME_WIDTH, 64) in device.settings
+    device.plugged.clear()
+    await until(lambda: camera.health.state == "degraded")
+    await until(lambda: "no such camera" in camera.health.detail)
+    out.drain()
+    device.plugged.set()
+    await until(lambda: len(out) >= 3)
+    assert camera.health.state == "ok"
+    assert camera.health.counters["reopens"] >= 1
+    seqs = [f.seq for f in out.drain()]
+    assert seqs == sorted(set(seqs))
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+    assert device.open_handles == 0
+    assert not [t for t in threading.enumerate() if t.name.startswith("v4l2")]
+
+
+@pytest.mark.parametrize("stamp_ms", [0.0, 12345.0, 1e15, -1.0])
+async def test_stamps_of_another_clock_are_replaced_by_the_arrival(stamp_ms: float) -> None:
+    device = Device(lambda: stamp_ms if stamp_ms != 12345.0 else monotonic_ms() - 60_000.0)
+    camera = V4l2Camera(V4l2Settings("/dev/video9"), opener=device.open)
+    out: DropOldestQueue[Frame] = DropOldestQueue(10)
+    task = asyncio.create_task(camera.run(out))
+    async with asyncio.timeout(5.0):
+        frame = await out.get()
+    assert 0 <= time.monotonic_ns() - frame.t_ns < 2_000_000_000
+    assert camera.health.counters["arrival_stamps"] >= 1
+    assert camera.health.detail.endswith("arrival")
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+
+
+async def test_absent_device_is_trouble_not_the_end(tmp_path: Path) -> None:
+    camera = V4l2Camera(V4l2Settings(str(tmp_path / "video0")))
+    task = asyncio.create_task(camera.run(DropOldestQueue(1)))
+    await until(lambda: camera.health.state == "degraded")
+    assert "no such camera" in camera.health.detail
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+
+
+def test_a_file_is_no_camera(tmp_path: Path) -> None:
+    path = tmp_path / "video0"
+    path.write_bytes(b"")
+    capture = open_v4l2(str(path))
+    assert not capture.isOpened()
+    capture.release()
+
+
+def test_pixel_format_has_four_letters() -> None:
+    with pytest.raises(ValueError, match="four"):
+        V4l2Camera(V4l2Settings("/dev/video0", fourcc="MJPEG"))

@@ -1,0 +1,269 @@
+"""What is published: one frozen struct a message, JSON on the wire.
+
+Every message names its schema, its hub, where its content came from, and when it was published. Readers
+tolerate fields they do not know; a change that an old reader would misread gets a new schema id. Coordinates
+are metres in the map frame of the message's `epoch` (x right, y up on the plan, z up).
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from typing import Any, Literal, TypeVar
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from vad.errors import ProtocolError
+
+Source = Literal["live", "replay", "simulated"]
+DeviceState = Literal["discovered", "waiting", "capturing", "mapped", "stale", "failed"]
+CameraState = Literal["uncalibrated", "collecting", "valid", "invalid", "recalibrating"]
+CaptureState = Literal["idle", "armed", "recording", "stopping", "solving", "done", "aborted"]
+PartState = Literal["starting", "ok", "degraded", "failed"]
+EventKind = Literal["joined", "mapped", "moved", "lost"]
+
+Point = tuple[float, float]
+Vector3 = tuple[float, float, float]
+Matrix2 = tuple[Point, Point]
+Matrix3 = tuple[Vector3, Vector3, Vector3]
+
+
+class Message(msgspec.Struct, frozen=True, kw_only=True):
+    """What all messages carry. The bus sets `hub` and `published_at` (RFC 3339, UTC) when it publishes."""
+
+    source: Source
+    hub: str = ""
+    published_at: str = ""
+
+
+class DeviceMessage(Message, frozen=True, kw_only=True):
+    """Where a Wi-Fi device is, how sure that is, and why it is not known where it is not.
+
+    reason: why it waits, failed or is stale; empty otherwise. covariance_m2: 2x2 of (x, y). radius90_m:
+    radius of the circle around (x, y) that holds 90 % of the posterior. region90: outline of the 90 % region,
+    metres. walks: how many walks went into the estimate. evidence: named counts (packets, seconds ...).
+    """
+
+    schema: Literal["vad.device.v1"] = "vad.device.v1"
+    mac: str
+    name: str | None = None
+    state: DeviceState
+    reason: str = ""
+    x_m: float | None = None
+    y_m: float | None = None
+    covariance_m2: Matrix2 | None = None
+    radius90_m: float | None = None
+    region90: tuple[Point, ...] | None = None
+    room: str | None = None
+    epoch: int = 0
+    walks: int = 0
+    evidence: dict[str, float] = {}
+    updated_at: str | None = None
+    method: str | None = None
+
+    @property
+    def sigma_m(self) -> float | None:
+        """Standard deviation along the worst direction (square root of the larger eigenvalue), metres."""
+        if self.covariance_m2 is None:
+            return None
+        (a, b), (_, c) = self.covariance_m2
+        return math.sqrt(max(0.0, (a + c) / 2 + math.hypot((a - c) / 2, b)))
+
+
+class CameraMessage(Message, frozen=True, kw_only=True):
+    """A camera's place and how good it is.
+
+    percent: 0-100, how much of the calibration's evidence is there. position_m: optical centre in the map.
+    map_from_camera: rotation, row-major. map_from_image: homography of undistorted pixels to the floor.
+    deviation_m: mean floor error over the pairs. time_offset_ms: camera stamp minus pose stamp of one moment.
+    """
+
+    schema: Literal["vad.camera.v1"] = "vad.camera.v1"
+    id: str
+    state: CameraState
+    percent: float = 0.0
+    reason: str = ""
+    position_m: Vector3 | None = None
+    map_from_camera: Matrix3 | None = None
+    map_from_image: Matrix3 | None = None
+    deviation_m: float | None = None
+    time_offset_ms: float | None = None
+    epoch: int = 0
+    pairs: int = 0
+
+
+class Room(msgspec.Struct, frozen=True, kw_only=True):
+    """A named room; its outline in the map frame."""
+
+    name: str
+    polygon_m: tuple[Point, ...]
+
+
+class MapMessage(Message, frozen=True, kw_only=True):
+    """The floor plan's frame; the picture itself is at `map/grid`.
+
+    bounds_m: x0, y0, x1, y1. origin: x_m, y_m, yaw_rad of the lower-left corner of the grid's lower-left
+    cell. width, height: cells.
+    """
+
+    schema: Literal["vad.map.v1"] = "vad.map.v1"
+    epoch: int
+    bounds_m: tuple[float, float, float, float]
+    resolution_m: float
+    origin: Vector3
+    width: int
+    height: int
+    rooms: tuple[Room, ...] = ()
+
+
+class HeatmapMessage(Message, frozen=True, kw_only=True):
+    """A device's posterior over the map.
+
+    bounds_m: x0, y0, x1, y1 of the outer cell edges; step_m: the cells' side. probability: base64 in JSON of
+    zlib of little-endian float32, row-major, `height` rows of `width`, row 0 at y0; it sums to 1.
+    """
+
+    schema: Literal["vad.heatmap.v1"] = "vad.heatmap.v1"
+    mac: str
+    epoch: int
+    bounds_m: tuple[float, float, float, float]
+    step_m: float
+    width: int
+    height: int
+    probability: bytes
+
+
+class Part(msgspec.Struct, frozen=True, kw_only=True):
+    """Health of one part of the daemon."""
+
+    part: str
+    state: PartState
+    detail: str = ""
+    last_error: str = ""
+    counters: dict[str, int] = {}
+
+
+class StatusMessage(Message, frozen=True, kw_only=True):
+    """How the daemon is. step: one sentence for people, what is going on now."""
+
+    schema: Literal["vad.status.v1"] = "vad.status.v1"
+    version: str
+    uptime_s: float
+    step: str = ""
+    parts: tuple[Part, ...] = ()
+
+
+class CaptureResult(msgspec.Struct, frozen=True, kw_only=True):
+    """What one capture said about its device."""
+
+    x_m: float
+    y_m: float
+    radius90_m: float
+
+
+class CaptureMessage(Message, frozen=True, kw_only=True):
+    """Progress (0 to 1) and result of one capture. walk_s: seconds of walking recorded so far."""
+
+    schema: Literal["vad.capture.v1"] = "vad.capture.v1"
+    session: str
+    mac: str
+    state: CaptureState
+    reason: str = ""
+    packets: int = 0
+    walk_s: float = 0.0
+    progress: float = 0.0
+    result: CaptureResult | None = None
+
+
+class EventMessage(Message, frozen=True, kw_only=True):
+    """Something happened to a device."""
+
+    schema: Literal["vad.event.v1"] = "vad.event.v1"
+    kind: EventKind
+    mac: str
+    text: str
+
+
+class ErrorMessage(msgspec.Struct, frozen=True, kw_only=True):
+    """Why a query is refused: a code for programs, a sentence for people."""
+
+    schema: Literal["vad.error.v1"] = "vad.error.v1"
+    code: Literal["bad_selector", "internal"]
+    text: str
+
+
+ALL: tuple[type[msgspec.Struct], ...] = (
+    DeviceMessage,
+    CameraMessage,
+    MapMessage,
+    HeatmapMessage,
+    StatusMessage,
+    CaptureMessage,
+    EventMessage,
+    ErrorMessage,
+)
+"""Every message type that has a schema of its own."""
+
+M = TypeVar("M", bound=msgspec.Struct)
+
+
+def schema_id(kind: type[msgspec.Struct]) -> str:
+    """The schema id of a message type, e.g. `vad.device.v1`."""
+    for field in msgspec.structs.fields(kind):
+        if field.name == "schema":
+            return str(field.default)
+    raise TypeError(f"{kind.__name__} has no schema field")
+
+
+def encoding_of(kind: type[msgspec.Struct]) -> str:
+    """The zenoh encoding of a message type: `application/json;<schema id>`."""
+    return f"application/json;{schema_id(kind)}"
+
+
+def encode(message: msgspec.Struct) -> bytes:
+    """A message as JSON bytes."""
+    return msgspec.json.encode(message)
+
+
+def decode(payload: bytes, kind: type[M]) -> M:
+    """JSON bytes as a message; msgspec.DecodeError (ValidationError among them) for anything else."""
+    return msgspec.json.decode(payload, type=kind)
+
+
+def heatmap_message(
+    probability: NDArray[np.floating[Any]],
+    *,
+    source: Source,
+    mac: str,
+    epoch: int,
+    bounds_m: tuple[float, float, float, float],
+    step_m: float,
+) -> HeatmapMessage:
+    """The message of a posterior. probability: (height, width), row 0 at y0, any positive scale."""
+    height, width = probability.shape
+    normal = (probability / probability.sum()).astype("<f4")
+    return HeatmapMessage(
+        source=source,
+        mac=mac,
+        epoch=epoch,
+        bounds_m=bounds_m,
+        step_m=step_m,
+        width=width,
+        height=height,
+        probability=zlib.compress(normal.tobytes()),
+    )
+
+
+def probabilities(heatmap: HeatmapMessage) -> NDArray[np.float32]:
+    """The posterior as (height, width) float32, row 0 at y0; ProtocolError where the sizes disagree."""
+    cells = heatmap.width * heatmap.height
+    try:
+        # bounded: a small message must not unpack into the whole memory
+        raw = zlib.decompressobj().decompress(heatmap.probability, 4 * max(cells, 0) + 1)
+    except zlib.error as error:
+        raise ProtocolError(f"the heatmap is damaged: {error}", where=heatmap.mac) from error
+    if heatmap.width < 1 or heatmap.height < 1 or len(raw) != 4 * cells:
+        raise ProtocolError("the heatmap's size is not the one it states", where=heatmap.mac)
+    return np.frombuffer(raw, "<f4").astype(np.float32).reshape(heatmap.height, heatmap.width)

@@ -1,0 +1,1 @@
+"""Who is measured when: the handshake, the session folder."""

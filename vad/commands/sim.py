@@ -1,0 +1,58 @@
+"""`vad sim`: a simulated home to point a daemon at."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import signal
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from vad.commands.console import out
+
+
+def sim(
+    folder: Annotated[Path, typer.Option("--dir", help="Where its files go.")] = Path("simulated-home"),
+    seed: Annotated[int, typer.Option(help="Which home: rooms, places and walks follow from it.")] = 1,
+    bus_port: Annotated[int, typer.Option(help="Where the daemon's zenoh router shall listen.")] = 7447,
+    fifo: Annotated[
+        bool, typer.Option("--fifo", help="CSI through a FIFO even where netlink would be allowed.")
+    ] = False,
+) -> None:
+    """Play a simulated home in real time until Ctrl-C: robot, camera, radio, hostapd.
+
+    It writes vad.yaml for `vad run`, the floor plan, and truth.json. The radio speaks real NETLINK_CONNECTOR
+    where it may (root), else a FIFO.
+
+    Example:  vad sim --dir home --seed 3 &  vad run --config home/vad.yaml
+    """
+    asyncio.run(_play(folder, seed, bus_port, fifo))
+
+
+async def _play(folder: Path, seed: int, bus_port: int, fifo: bool) -> None:
+    from vad.sim.driver import ConnectorSender
+    from vad.sim.home import SimulatedHome
+    from vad.sim.scenario import make_home
+
+    connector = not fifo and ConnectorSender.permitted()
+    scenario = make_home(seed)
+    home = SimulatedHome(scenario, folder, bus_port=bus_port, connector=connector)
+    ready = asyncio.Event()
+    playing = asyncio.create_task(home.run(ready))
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, playing.cancel)
+    opened = asyncio.create_task(ready.wait())
+    await asyncio.wait({playing, opened}, return_when=asyncio.FIRST_COMPLETED)
+    opened.cancel()
+    if ready.is_set():
+        way = "NETLINK_CONNECTOR" if connector else "a FIFO"
+        out.print(f"home {seed} runs; CSI over {way}; settings: {folder / 'vad.yaml'}", soft_wrap=True)
+        out.print(
+            f"robot drives until {scenario.drive_end_s:.0f} s, the device joins at {scenario.join_s:.0f} s, "
+            f"walks from {scenario.walks[0].start_s:.0f} s to {scenario.walks[-1].end_s:.0f} s"
+        )
+    with contextlib.suppress(asyncio.CancelledError):
+        await playing

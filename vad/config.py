@@ -1,0 +1,188 @@
+"""Typed settings: one YAML file, every key known, every error with its path."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+import yaml
+from msgspec import Meta
+
+from vad.errors import ConfigError
+
+Positive = Annotated[float, Meta(gt=0)]
+Id = Annotated[str, Meta(pattern="^[A-Za-z0-9_-]{1,64}$")]
+MacText = Annotated[str, Meta(pattern="^[0-9A-Fa-f]{2}(:[0-9A-Fa-f]{2}){5}$")]
+
+
+class NeatoRobot(msgspec.Struct, tag="neato", frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Neato Botvac D3-D7 over serial. port: device path, pty, socket:// or rfc2217:// URL."""
+
+    port: str
+    rate_hz: Positive = 5.0
+
+
+class ZenohRobot(msgspec.Struct, tag="zenoh-json", frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A home-made robot that puts JSON poses on a zenoh key."""
+
+    key: str
+
+
+class V4l2CameraSettings(msgspec.Struct, tag="v4l2", frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A USB or built-in camera. device: /dev/video0 or a /dev/v4l/by-id path."""
+
+    device: str
+    width_px: int = 640
+    height_px: int = 480
+    fps: Positive = 15.0
+
+
+class MjpegCameraSettings(msgspec.Struct, tag="mjpeg", frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A camera that serves MJPEG over HTTP (ustreamer, mjpg-streamer, ESP32-CAM, go2rtc)."""
+
+    url: str
+
+
+class FolderCameraSettings(
+    msgspec.Struct, tag="folder", frozen=True, forbid_unknown_fields=True, kw_only=True
+):
+    """Recorded pictures (a folder with times.csv) or a video file, played at their own times."""
+
+    path: str
+
+
+class CameraSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The camera. id: its name on the bus; focal_px: known focal length, else it is estimated."""
+
+    source: V4l2CameraSettings | MjpegCameraSettings | FolderCameraSettings
+    id: Id = "main"
+    focal_px: Positive | None = None
+
+
+class ConnectorCsi(msgspec.Struct, tag="connector", frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Intel 5300 over netlink. group: 26 on every kernel since 2.6.3x; allow_user_space: take packets that do
+    not come from the kernel (emulators only)."""
+
+    group: Annotated[int, Meta(ge=1, le=1000)] = 26
+    allow_user_space: bool = False
+
+
+class FollowCsi(msgspec.Struct, tag="follow", frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A CSI log that another program writes: a FIFO or a growing file in log_to_file's format."""
+
+    path: str
+
+
+class RadioSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The hub's CSI radio. antenna_offset_m: where its antennas are from the camera, along the map's axes."""
+
+    source: ConnectorCsi | FollowCsi = ConnectorCsi()
+    carrier_hz: Positive = 5.24e9
+    bandwidth_mhz: Literal[20, 40] = 20
+    antenna_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+class StaticDevice(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A device that is known without a join event."""
+
+    mac: MacText
+    name: str | None = None
+
+
+class DeviceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Who may appear on the map. hostapd: control sockets, e.g. /run/hostapd/wlan0."""
+
+    hostapd: tuple[str, ...] = ()
+    static: tuple[StaticDevice, ...] = ()
+    ignore: tuple[MacText, ...] = ()
+
+
+class MapSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The floor plan. file: a map_server YAML beside its picture; epoch: raise it when the map changes."""
+
+    file: str
+    epoch: Annotated[int, Meta(ge=0)] = 1
+
+
+class BusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """zenoh. listen: loopback only unless TLS is set up; connect: other routers."""
+
+    listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    connect: tuple[str, ...] = ()
+
+
+class CaptureSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """When a device counts as mapped, and how long a capture may be.
+
+    mapped_radius_m: 90 % region at which measuring stops; min_walks: at least as many walks.
+    """
+
+    mapped_radius_m: Positive = 0.8
+    min_walks: Annotated[int, Meta(ge=1)] = 2
+    max_walks: Annotated[int, Meta(ge=1)] = 8
+    min_s: Positive = 6.0
+    max_s: Positive = 30.0
+
+
+class VisionSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """People in the picture. model: a MoveNet MultiPose ONNX file, else the packaged one."""
+
+    model: str | None = None
+    max_fps: Positive = 10.0
+    threads: Annotated[int, Meta(ge=1, le=16)] = 1
+
+
+class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """vad.yaml.
+
+    hub: the name in every zenoh key; source: `simulated` marks every message of a simulated home;
+    state_dir: database and session folders.
+    """
+
+    map: MapSettings
+    robot: NeatoRobot | ZenohRobot
+    camera: CameraSettings
+    radio: RadioSettings
+    devices: DeviceSettings
+    hub: Id = "home"
+    source: Literal["live", "simulated"] = "live"
+    state_dir: str = "/var/lib/vad"
+    bus: BusSettings = BusSettings()
+    capture: CaptureSettings = CaptureSettings()
+    vision: VisionSettings = VisionSettings()
+
+
+def parse_settings(text: str, *, where: str) -> Settings:
+    """YAML text as Settings; ConfigError names `where` and the key's path."""
+    try:
+        raw: Any = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f" in line {mark.line + 1}" if mark else ""
+        raise ConfigError(f"not YAML{line}", where=where, remedy="Check the indentation") from error
+    if not isinstance(raw, dict):
+        raise ConfigError("the file holds no settings", where=where, remedy="See config/vad.yaml")
+    try:
+        return msgspec.convert(raw, type=Settings, strict=False)  # YAML 1.1 reads 5.24e9 as text
+    except msgspec.ValidationError as error:
+        what, _, path = str(error).partition(" - at ")
+        raise ConfigError(what, where=f"{where}: {path.strip('`') or '$'}") from error
+
+
+def load_settings(path: Path) -> Settings:
+    """Read and check a settings file; relative paths inside it are taken from its folder."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(
+            f"cannot be read ({error.strerror})", where=str(path), remedy="Give the file with --config"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise ConfigError("not UTF-8 text", where=str(path)) from error
+    return parse_settings(text, where=str(path))
+
+
+def resolve(path: str, config_file: Path) -> Path:
+    """A path from the settings, relative ones from the settings file's folder."""
+    return (config_file.parent / path).resolve()

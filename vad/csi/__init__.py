@@ -1,0 +1,1 @@
+"""CSI packets off the air: decoding, live sources, whose packet it is."""

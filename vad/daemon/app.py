@@ -1,0 +1,271 @@
+"""The composition root: one TaskGroup, signals, status; everything else is somebody's room."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vad import __version__
+from vad.bus import messages as m
+from vad.bus.grid import grid_to_png
+from vad.bus.node import Bus, now_rfc3339
+from vad.bus.session import BusSettings as NodeSettings
+from vad.camera.frame import Frame
+from vad.config import Settings, resolve
+from vad.csi.packets import CsiBatch
+from vad.daemon.adapters import camera_source, csi_source, join_sources, robot_source
+from vad.daemon.captures import Captures
+from vad.daemon.ears import Ears
+from vad.daemon.eyes import Eyes
+from vad.daemon.notify import notify
+from vad.daemon.registry import Registry
+from vad.devices.station import StationEvent
+from vad.health import Health
+from vad.mapping.camera_calibration import CameraCalibration
+from vad.robot.floor_plan import FloorPlan
+from vad.robot.map_server import load_floor_plan
+from vad.robot.pose import RobotPose
+from vad.store.records import CameraRecord, EpochRecord
+from vad.store.worker import StoreWorker
+from vad.streams import DropOldestQueue
+from vad.vision.people import PoseNetwork
+
+_log = logging.getLogger(__name__)
+
+STATUS_EVERY_S = 0.5
+
+
+class _StopRequestedError(Exception):
+    """SIGINT or SIGTERM came."""
+
+
+async def run_daemon(settings: Settings, config_file: Path) -> None:
+    """Run until SIGINT or SIGTERM; VadError where something without which nothing works is missing."""
+    plan = await asyncio.to_thread(
+        load_floor_plan, resolve(settings.map.file, config_file), epoch=settings.map.epoch
+    )
+    model = resolve(settings.vision.model, config_file) if settings.vision.model else None
+    network = await asyncio.to_thread(PoseNetwork, model, threads=settings.vision.threads)
+    state_dir = resolve(settings.state_dir, config_file)
+    store = StoreWorker(state_dir / "vad.sqlite")
+    bus = Bus(NodeSettings(hub=settings.hub, listen=settings.bus.listen, connect=settings.bus.connect))
+    await store.open()
+    try:
+        await bus.open()
+        try:
+            daemon = Daemon(settings, config_file, state_dir, plan, network, bus, store)
+            await daemon.run()
+        finally:
+            await bus.close()
+    finally:
+        await store.close()
+
+
+class Daemon:
+    """Owns every task of the running daemon."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        config_file: Path,
+        state_dir: Path,
+        plan: FloorPlan,
+        network: PoseNetwork,
+        bus: Bus,
+        store: StoreWorker,
+    ) -> None:
+        self._settings = settings
+        self._base = config_file.parent
+        self._state_dir = state_dir
+        self._plan = plan
+        self._network = network
+        self._bus = bus
+        self._store = store
+        self._started = time.monotonic()
+        self._calibrations: DropOldestQueue[CameraCalibration] = DropOldestQueue(1)
+
+    async def run(self) -> None:
+        """Run everything until a signal; re-raises what breaks a task."""
+        stop = asyncio.Event()
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, stop.set)
+        try:
+            async with asyncio.TaskGroup() as group:
+                group.create_task(_raise_on(stop), name="signals")
+                await self._start(group)
+                notify("READY=1")
+        except* _StopRequestedError:
+            notify("STOPPING=1")
+        finally:
+            for number in (signal.SIGINT, signal.SIGTERM):
+                loop.remove_signal_handler(number)
+
+    async def _start(self, group: asyncio.TaskGroup) -> None:
+        settings = self._settings
+        known = await self._known_camera()
+        eyes = Eyes(
+            self._network,
+            max_fps=settings.vision.max_fps,
+            focal_px=settings.camera.focal_px,
+            known=known,
+            on_calibration=self._calibrations.put,
+        )
+        ears = Ears()
+        registry = Registry(settings, self._plan, self._bus, self._store)
+        await registry.load()
+        captures = Captures(settings, self._state_dir, self._plan, eyes, ears, registry, self._bus)
+        self._publish_map()
+        self._publish_camera(eyes.calibration)
+
+        robot = robot_source(settings, self._bus.session)
+        camera = camera_source(settings.camera, self._base)
+        csi = csi_source(settings.radio, self._base)
+        joins = join_sources(settings.devices, self._base)
+        poses: DropOldestQueue[RobotPose] = DropOldestQueue(256)
+        frames: DropOldestQueue[Frame] = DropOldestQueue(2)
+        batches: DropOldestQueue[CsiBatch] = DropOldestQueue(256)
+        stations: DropOldestQueue[StationEvent] = DropOldestQueue(1024)
+        group.create_task(robot.run(poses), name="robot")
+        group.create_task(camera.run(frames), name="camera")
+        group.create_task(csi.run(batches), name="csi")
+        for source in joins:
+            group.create_task(source.run(stations), name="joins")
+        group.create_task(eyes.follow_robot(poses), name="robot poses")
+        group.create_task(eyes.run(frames), name="vision")
+        group.create_task(ears.run(batches), name="ears")
+        group.create_task(_register(stations, registry), name="stations")
+        group.create_task(captures.run(), name="captures")
+        group.create_task(self._keep_calibrations(), name="calibrations")
+        parts = [robot.health, camera.health, eyes.health, csi.health, self._bus.health]
+        queues: dict[str, DropOldestQueue[Any]] = {"poses": poses, "frames": frames, "csi": batches}
+        group.create_task(
+            self._tell_status([*parts, *(s.health for s in joins)], queues, captures), name="status"
+        )
+
+    async def _known_camera(self) -> CameraCalibration | None:
+        """The calibration of an earlier run, if the map is still the same."""
+        epoch = self._plan.epoch
+        await self._store.save_epoch(EpochRecord(epoch, str(self._plan.bounds_m), now_rfc3339()))
+        for record in await self._store.cameras(epoch):
+            if record.id == self._settings.camera.id:
+                known = CameraCalibration.from_dict(record.calibration)
+                return known if known.status == "valid" else None
+        return None
+
+    async def _keep_calibrations(self) -> None:
+        """Store and publish each new calibration, until cancelled."""
+        while True:
+            calibration = await self._calibrations.get()
+            if calibration.status == "valid":
+                record = CameraRecord(
+                    self._settings.camera.id, self._plan.epoch, calibration.to_dict(), now_rfc3339()
+                )
+                await self._store.save_camera(record)
+            self._publish_camera(calibration)
+
+    async def _tell_status(
+        self, parts: list[Health], queues: dict[str, DropOldestQueue[Any]], captures: Captures
+    ) -> None:
+        """Publish the status until cancelled."""
+        said = ""
+        while True:
+            dropped = {f"dropped_{name}": queue.dropped for name, queue in queues.items()}
+            daemon = m.Part(part="daemon", state="ok", detail=captures.step, counters=dropped)
+            self._bus.publish_status(
+                m.StatusMessage(
+                    source=self._settings.source,
+                    version=__version__,
+                    uptime_s=round(time.monotonic() - self._started, 1),
+                    step=captures.step,
+                    parts=(daemon, *(_part(health) for health in parts)),
+                )
+            )
+            if captures.step != said:
+                said = captures.step
+                notify(f"STATUS={said}")
+                _log.info("%s", said)
+            await asyncio.sleep(STATUS_EVERY_S)
+
+    def _publish_map(self) -> None:
+        plan = self._plan
+        rows, columns = plan.cells.shape
+        self._bus.publish_map(
+            m.MapMessage(
+                source=self._settings.source,
+                epoch=plan.epoch,
+                bounds_m=plan.bounds_m,
+                resolution_m=plan.resolution_m,
+                origin=plan.origin,
+                width=columns,
+                height=rows,
+                rooms=tuple(
+                    m.Room(name=room.name, polygon_m=tuple((float(x), float(y)) for x, y in room.polygon))
+                    for room in plan.rooms
+                ),
+            )
+        )
+        self._bus.publish_grid(grid_to_png(plan.cells))
+
+    def _publish_camera(self, calibration: CameraCalibration) -> None:
+        position, pose = calibration.position_m, calibration.camera_from_map
+        offset_s = calibration.time_offset_s
+        self._bus.publish_camera(
+            m.CameraMessage(
+                source=self._settings.source,
+                id=self._settings.camera.id,
+                state=calibration.status,
+                percent=float(calibration.percent),
+                reason=calibration.reason,
+                position_m=None if position is None else _vector3(position),
+                map_from_camera=None if pose is None else _matrix3(pose.inverse().rotation),
+                map_from_image=_matrix3(calibration.map_from_image),
+                deviation_m=_plain(calibration.deviation_m),
+                time_offset_ms=None if offset_s is None else float(offset_s) * 1e3,
+                epoch=self._plan.epoch,
+                pairs=int(calibration.pairs),
+            )
+        )
+
+
+async def _raise_on(stop: asyncio.Event) -> None:
+    await stop.wait()
+    raise _StopRequestedError
+
+
+async def _register(stations: DropOldestQueue[StationEvent], registry: Registry) -> None:
+    while True:
+        event = await stations.get()
+        if event.kind == "joined":
+            await registry.joined(event.mac, event.name)
+
+
+def _part(health: Health) -> m.Part:
+    return m.Part(
+        part=health.part,
+        state=health.state,
+        detail=health.detail,
+        last_error=health.last_error,
+        counters=dict(health.counters),
+    )
+
+
+def _matrix3(matrix: np.ndarray[Any, np.dtype[np.float64]] | None) -> m.Matrix3 | None:
+    if matrix is None:
+        return None
+    a, b, c = (_vector3(row) for row in matrix)
+    return a, b, c
+
+
+def _vector3(values: np.ndarray[Any, np.dtype[np.float64]]) -> m.Vector3:
+    return float(values[0]), float(values[1]), float(values[2])
+
+
+def _plain(value: float | None) -> float | None:
+    return None if value is None else float(value)

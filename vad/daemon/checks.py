@@ -1,0 +1,19 @@
+"""What can be told of the settings without starting: the files they name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from vad.bus.session import check_endpoint
+from vad.config import Settings, resolve
+from vad.errors import ConfigError
+from vad.robot.map_server import load_floor_plan
+
+
+def check_files(settings: Settings, config_file: Path) -> None:
+    """ConfigError for the first setting whose file or address cannot be used."""
+    load_floor_plan(resolve(settings.map.file, config_file), epoch=settings.map.epoch)
+    if settings.vision.model and not resolve(settings.vision.model, config_file).is_file():
+        raise ConfigError("no such file", where=f"{config_file}: $.vision.model")
+    for endpoint in settings.bus.listen:
+        check_endpoint(endpoint)

@@ -1,0 +1,1 @@
+"""Who joined the Wi-Fi network."""

@@ -1,0 +1,322 @@
+"""Stage 1: the camera's place from a drive of the robot, without a detector that knows robots. Pure.
+
+What moves in the picture and moves on the floor as the robot says it does, is the robot: the consensus of
+candidates and poses names the robot, finds the time offset and calibrates the camera at once
+(formats.md 11; the paper's eq. 3 and 4 reconciled in one least-squares estimate).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vad.geometry import FloatArray, Intrinsics, apply_homography, floor_homography, undistort
+from vad.mapping.camera_calibration import PARAMETERS, CameraCalibration, CameraStatus
+from vad.mapping.camera_fit import OFFSET, Fit, Start, predict, refine, starting_pose, surprise
+from vad.mapping.camera_track import (
+    CONSENSUS_M,
+    Consensus,
+    PoseTrack,
+    Sightings,
+    consensus,
+    search_time_offset,
+)
+
+MIN_PAIRS = 15
+MIN_AREA_M2 = 0.5
+MIN_WIDTH_M = 0.12
+MAX_POSITION_SIGMA_M = 0.3
+MAX_DEVIATION_M = 0.12
+# The robot must be what moves where it says it is in this share of the frames that should show it moving.
+MIN_AGREEING = 0.4
+# So many frames with something moving, and none of it the robot, are a verdict and not a lack of data.
+VERDICT_FRAMES = 150
+
+SOLVE_FRAMES = 1200
+_SEARCH_FRAMES = 80
+_KEPT_FRAMES = 6000
+_KEPT_POSES = 60_000
+_CELL_M = 0.25
+_ROUNDS = 4
+# A pair this many standard deviations off is something else.
+_MAX_SURPRISE = 4.0
+# The pose must be known this long around a pair, for its derivative in time.
+_TIME_MARGIN_S = 0.25
+_MOVING_M_S = 0.05
+
+
+class CameraMapper:
+    """Collects poses and candidates of one camera under one map epoch, and solves for the camera.
+
+    Feed both in any order as they come; `solve` whenever a result is wanted. For a new map epoch or a moved
+    camera make a new one.
+
+    Args:
+        width_px, height_px: of the picture.
+        intrinsics: of a calibrated lens; without it the focal length and one radial term are estimated with
+            the principal point in the centre.
+    """
+
+    def __init__(self, width_px: int, height_px: int, intrinsics: Intrinsics | None = None) -> None:
+        if intrinsics is not None and (intrinsics.width_px, intrinsics.height_px) != (width_px, height_px):
+            raise ValueError("the intrinsics are of another picture size")
+        focal = float(width_px)
+        self._lens = intrinsics or Intrinsics(
+            width_px, height_px, focal, focal, (width_px - 1) / 2, (height_px - 1) / 2
+        )
+        self._lens_known = intrinsics is not None
+        self._poses: deque[tuple[int, float, float, float]] = deque(maxlen=_KEPT_POSES)
+        self._frames: deque[tuple[int, FloatArray, FloatArray]] = deque(maxlen=_KEPT_FRAMES)
+
+    def add_pose(self, t_ns: int, x_m: float, y_m: float, sigma_m: float) -> None:
+        """One robot pose, map frame, at its own stamp."""
+        self._poses.append((t_ns, x_m, y_m, sigma_m))
+
+    def add_candidates(self, t_ns: int, image_px: ArrayLike, sigma_px: ArrayLike) -> None:
+        """What may be the robot in one frame: (N, 2) floor contacts in raw pixels, sigma scalar or (N,)."""
+        px = np.asarray(image_px, dtype=np.float64).reshape(-1, 2)
+        if len(px):
+            sigma = np.broadcast_to(np.asarray(sigma_px, dtype=np.float64), (len(px),))
+            self._frames.append((t_ns, px, sigma.copy()))
+
+    def solve(self) -> CameraCalibration:
+        """The best calibration from what was collected, or what is missing. Under 0.5 s."""
+        if len(self._poses) < 2:
+            return CameraCalibration("uncalibrated", 0, "no robot poses have come yet")
+        if not self._frames:
+            return CameraCalibration("uncalibrated", 0, "nothing has moved in the picture yet")
+        origin_ns = self._poses[0][0]
+        table = np.array([(1e-9 * (t - origin_ns), x, y, s) for t, x, y, s in self._poses])
+        track = PoseTrack(table[:, 0], table[:, 1:3], table[:, 3])
+        sightings = self._chosen(track, origin_ns)
+        frames = len(np.unique(sightings.frame))
+        xy, _ = track.at(sightings.t_s)
+        if frames < MIN_PAIRS:
+            return CameraCalibration(
+                "collecting", 99 * frames // MIN_PAIRS, f"{frames} of {MIN_PAIRS} pictures of a moving robot"
+            )
+        area_m2, width_m = spread(xy)
+        if (refused := _spread_gate(area_m2, width_m)) is not None:
+            return CameraCalibration("collecting", refused[0], refused[1])
+        fit = self._fit(sightings, track)
+        if fit is None:
+            return _no_consensus(frames, 0)
+        return self._judge(*fit, sightings, track)
+
+    def _chosen(self, track: PoseTrack, origin_ns: int) -> Sightings:
+        """At most SOLVE_FRAMES frames, spread evenly over the floor that was driven."""
+        frame_s = np.array([1e-9 * (t - origin_ns) for t, _, _ in self._frames])
+        xy, _ = track.at(frame_s)
+        rows = spread_selection(xy, SOLVE_FRAMES)
+        chosen = [self._frames[row] for row in rows]
+        counts = [len(px) for _, px, _ in chosen]
+        empty = np.empty((0, 2))
+        return Sightings(
+            np.repeat(np.arange(len(rows)), counts),
+            np.repeat(frame_s[rows], counts),
+            np.concatenate([empty, *(px for _, px, _ in chosen)]),
+            np.concatenate([empty[:, 0], *(sigma for _, _, sigma in chosen)]),
+        )
+
+    def _fit(self, sightings: Sightings, track: PoseTrack) -> tuple[Fit, Sightings] | None:
+        straight = undistort(sightings.image_px, self._lens)
+        few = sightings.frame < _SEARCH_FRAMES
+        found = search_time_offset(straight[few], sightings.take(few), track)
+        found = found and consensus(straight, sightings, track, found.time_offset_s)
+        if found is None or found.frames < 6:
+            return None
+        start = self._start(found, straight, sightings, track)
+        if start is None:
+            return None
+        free = np.ones(PARAMETERS + 1, dtype=np.bool_)
+        free[6:PARAMETERS] = not self._lens_known
+        named = self._agreeing(found, straight, sightings, track)
+        result: tuple[Fit, Sightings] | None = None
+        for _ in range(_ROUNDS):
+            if len(named) < 6:
+                return None
+            pairs = sightings.take(named)
+            fit = refine(start, pairs, track, free=free)
+            if fit is None:
+                return None
+            start, result = fit.at, (fit, pairs)
+            before, named = named, self._named(start, sightings, track)
+            if np.array_equal(before, named):
+                break
+        return result
+
+    def _agreeing(
+        self, found: Consensus, straight: FloatArray, sightings: Sightings, track: PoseTrack
+    ) -> NDArray[np.int64]:
+        xy, _ = track.at(sightings.t_s + found.time_offset_s)
+        miss = np.linalg.norm(apply_homography(found.map_from_image, straight) - xy, axis=1)
+        miss = np.where(_inside(track, sightings.t_s + found.time_offset_s), miss, np.inf)
+        return best_of_each(sightings.frame, miss, CONSENSUS_M)
+
+    def _named(self, at: Start, sightings: Sightings, track: PoseTrack) -> NDArray[np.int64]:
+        odd = surprise(at, sightings, track)
+        odd = np.where(_inside(track, sightings.t_s + at.time_offset_s), odd, np.inf)
+        return best_of_each(sightings.frame, odd, _MAX_SURPRISE)
+
+    def _start(
+        self, found: Consensus, straight: FloatArray, sightings: Sightings, track: PoseTrack
+    ) -> Start | None:
+        rows = self._agreeing(found, straight, sightings, track)
+        xy, _ = track.at(sightings.t_s[rows] + found.time_offset_s)
+        if len(rows) < 6:
+            return None
+        pose = starting_pose(straight[rows], xy, self._lens, focal_known=self._lens_known)
+        return None if pose is None else Start(*pose, found.time_offset_s)
+
+    def _judge(self, fit: Fit, pairs: Sightings, sightings: Sightings, track: PoseTrack) -> CameraCalibration:
+        at, lens = fit.at, fit.at.intrinsics
+        xy, _ = track.at(pairs.t_s + at.time_offset_s)
+        map_from_image = floor_homography(lens, at.camera_from_map)
+        predicted, _ = predict(at, pairs, track)
+        seen = apply_homography(map_from_image, undistort(predicted + fit.left_out_px, lens))
+        deviation_m = float(np.nanmean(np.linalg.norm(seen - xy, axis=1)))
+        free_homography, _ = cv2.findHomography(
+            undistort(pairs.image_px, lens), xy, cv2.RANSAC, CONSENSUS_M, maxIters=400
+        )
+        gap_m = None
+        if free_homography is not None:
+            own = apply_homography(map_from_image, undistort(pairs.image_px, lens))
+            other = apply_homography(
+                np.asarray(free_homography, dtype=np.float64), undistort(pairs.image_px, lens)
+            )
+            gap_m = float(np.nanmean(np.linalg.norm(own - other, axis=1)))
+        covariance = fit.covariance[:PARAMETERS, :PARAMETERS]
+        status, percent, reason = self._gates(fit, xy, deviation_m, pairs, sightings, track)
+        return CameraCalibration(
+            status=status,
+            percent=percent,
+            reason=reason,
+            pairs=len(pairs.frame),
+            unseen=self._unseen(pairs),
+            camera_from_map=at.camera_from_map,
+            intrinsics=lens,
+            focal_sigma_px=lens.fx_px * float(np.sqrt(covariance[6, 6])),
+            map_from_image=map_from_image,
+            deviation_m=deviation_m,
+            homography_gap_m=gap_m,
+            time_offset_s=at.time_offset_s,
+            time_offset_sigma_s=float(np.sqrt(fit.covariance[OFFSET, OFFSET])),
+            parameter_covariance=covariance,
+        )
+
+    def _gates(
+        self,
+        fit: Fit,
+        xy_m: FloatArray,
+        deviation_m: float,
+        pairs: Sightings,
+        sightings: Sightings,
+        track: PoseTrack,
+    ) -> tuple[CameraStatus, int, str]:
+        count, frames = len(pairs.frame), len(np.unique(sightings.frame))
+        if count < MIN_PAIRS:
+            refused = _no_consensus(frames, count)
+            return refused.status, refused.percent, refused.reason
+        share = self._share_agreeing(fit.at, pairs, sightings, track)
+        if share < MIN_AGREEING:
+            what = f"only {share:.0%} of the pictures that should show the robot show it where it says it is"
+            return ("invalid" if frames >= VERDICT_FRAMES else "collecting"), 50, what
+        if (refused_spread := _spread_gate(*spread(xy_m))) is not None:
+            percent, reason = refused_spread
+            return "collecting", percent, reason + self._advice(pairs)
+        if not deviation_m <= MAX_DEVIATION_M:
+            return "invalid", 99, f"robot and camera differ by {deviation_m:.2f} m on average"
+        sigma_m = float(np.sqrt(np.linalg.eigvalsh(fit.covariance[3:6, 3:6])[-1]))
+        if sigma_m > MAX_POSITION_SIGMA_M:
+            percent = int(99 * MAX_POSITION_SIGMA_M / sigma_m)
+            what = f"the camera's place is uncertain by {sigma_m:.2f} m: drive over more of the floor it sees"
+            return "collecting", percent, what + self._advice(pairs)
+        return "valid", 100, ""
+
+    def _share_agreeing(self, at: Start, pairs: Sightings, sightings: Sightings, track: PoseTrack) -> float:
+        """Share of the frames that should show the robot moving, in which it was found."""
+        predicted, _ = predict(at, sightings, track)
+        lens = at.intrinsics
+        when = sightings.t_s + at.time_offset_s
+        step = track.at(when + _TIME_MARGIN_S)[0] - track.at(when - _TIME_MARGIN_S)[0]
+        moving = np.linalg.norm(step, axis=1) > 2.0 * _TIME_MARGIN_S * _MOVING_M_S
+        inside = (predicted > 0.0).all(axis=1) & (predicted < (lens.width_px, lens.height_px)).all(axis=1)
+        expected = np.unique(sightings.frame[moving & inside])
+        return float(np.mean(np.isin(expected, pairs.frame))) if len(expected) else 0.0
+
+    def _unseen(self, pairs: Sightings) -> tuple[str, ...]:
+        third = np.clip((3.0 * pairs.image_px[:, 0] / self._lens.width_px).astype(int), 0, 2)
+        return tuple(name for k, name in enumerate(("left", "middle", "right")) if not np.any(third == k))
+
+    def _advice(self, pairs: Sightings) -> str:
+        unseen = self._unseen(pairs)
+        if not unseen:
+            return ""
+        return f"; the robot has not been seen in the {' and '.join(unseen)} third of the picture"
+
+
+def spread(xy_m: FloatArray) -> tuple[float, float]:
+    """Area of the convex hull, m^2, and the standard deviation across the narrow direction, m, of (N, 2)."""
+    known = xy_m[np.isfinite(xy_m[:, 0])]
+    if len(known) < 3:
+        return 0.0, 0.0
+    width = float(np.sqrt(max(np.linalg.eigvalsh(np.cov(known.T))[0], 0.0)))
+    return float(cv2.contourArea(cv2.convexHull(known.astype(np.float32)))), width
+
+
+def spread_selection(xy_m: FloatArray, limit: int) -> NDArray[np.int64]:
+    """Rows of (N, 2) positions, at most `limit`, taken round-robin from the cells of the floor; NaN left out.
+
+    The first rows are as evenly spread as the whole, so a prefix is a smaller selection.
+    """
+    rows = np.flatnonzero(np.isfinite(xy_m[:, 0]))
+    # A fixed permutation: within a cell early and late visits are taken alike, the same every time.
+    rows = np.random.default_rng(0).permutation(rows)
+    cells = np.floor(xy_m[rows] / _CELL_M).astype(np.int64)
+    _, cell = np.unique(cells, axis=0, return_inverse=True)
+    cell = cell.ravel()
+    order = np.argsort(cell, kind="stable")
+    first = np.searchsorted(cell[order], cell[order])
+    visit = np.empty(len(rows), dtype=np.int64)
+    visit[order] = np.arange(len(rows)) - first
+    return np.asarray(rows[np.argsort(visit, kind="stable")][:limit], dtype=np.int64)
+
+
+def best_of_each(frame: NDArray[np.int64], badness: FloatArray, limit: float) -> NDArray[np.int64]:
+    """Rows of the least bad candidate of every frame, where it is below `limit`; (K,) in, rows out."""
+    order = np.lexsort((np.where(np.isnan(badness), np.inf, badness), frame))
+    _, first = np.unique(frame[order], return_index=True)
+    best = order[first]
+    return np.asarray(best[badness[best] < limit], dtype=np.int64)
+
+
+def _inside(track: PoseTrack, t_s: FloatArray) -> NDArray[np.bool_]:
+    before, after = track.at(t_s - _TIME_MARGIN_S)[0], track.at(t_s + _TIME_MARGIN_S)[0]
+    return np.isfinite(before[:, 0]) & np.isfinite(after[:, 0])
+
+
+def _spread_gate(area_m2: float, width_m: float) -> tuple[int, str] | None:
+    if width_m < MIN_WIDTH_M:
+        return (
+            int(99 * width_m / MIN_WIDTH_M),
+            "the robot has driven along one line only: it must also drive across",
+        )
+    if area_m2 < MIN_AREA_M2:
+        return (
+            int(99 * area_m2 / MIN_AREA_M2),
+            f"the robot has been seen on {area_m2:.1f} m2 of floor, {MIN_AREA_M2} m2 are needed",
+        )
+    return None
+
+
+def _no_consensus(frames: int, agreeing: int) -> CameraCalibration:
+    if frames >= VERDICT_FRAMES:
+        return CameraCalibration("invalid", 0, "nothing in the picture moves as the robot says it does")
+    return CameraCalibration(
+        "collecting",
+        min(99, 99 * agreeing // MIN_PAIRS),
+        f"{agreeing} of {MIN_PAIRS} pictures show the robot where it says it is",
+    )

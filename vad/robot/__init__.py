@@ -1,0 +1,1 @@
+"""Where the robot is, and the floor plan it made."""

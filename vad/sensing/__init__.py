@@ -1,0 +1,1 @@
+"""Packets to Doppler spectrogram and path length change. Pure: arrays in, values out."""

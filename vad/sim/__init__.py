@@ -1,0 +1,1 @@
+"""The simulated home: robot, camera, radio and hostapd through their real interfaces."""

@@ -1,0 +1,115 @@
+"""A Neato Botvac on a pty: answers byte for byte like the robot (formats.md, section 5).
+
+Written from the protocol document, not from `vad.robot.neato`, so that each can prove the other wrong.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import os
+import pty
+import time
+import tty
+from collections.abc import Callable
+from pathlib import Path
+
+Pose = tuple[float, float, float]
+"""x_m, y_m, yaw_rad in the robot's map."""
+
+_MAX_LINE_BYTES = 256
+_END_OF_REPLY = b"\x1a"
+
+
+class VirtualNeato:
+    """The robot's debug port. The pty exists from construction until `run` ends or `close` is called.
+
+    Args:
+        pose_at: where the robot is at a time of the timeline; None while it is not localised.
+        link: a stable name for the port: a symbolic link to the pty, replaced if it is there.
+        latency_s: from command to reply; the pose is the one of the middle.
+    """
+
+    def __init__(
+        self, pose_at: Callable[[int], Pose | None], *, link: Path | None = None, latency_s: float = 0.004
+    ) -> None:
+        self._pose_at = pose_at
+        self._latency_s = latency_s
+        self._link = link
+        self._master, self._slave = pty.openpty()
+        # Our own descriptor of the slave keeps the line up while clients come and go.
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self._tty = os.ttyname(self._slave)
+        self._open = True
+        self._commands: asyncio.Queue[str] = asyncio.Queue()
+        self._line = bytearray()
+        self.answered = 0
+        if link is not None:
+            link.unlink(missing_ok=True)
+            link.symlink_to(self._tty)
+
+    @property
+    def path(self) -> str:
+        """What a client opens."""
+        return self._tty if self._link is None else str(self._link)
+
+    async def run(self) -> None:
+        """Answer commands until cancelled; then the port disappears, as when it is unplugged."""
+        loop = asyncio.get_running_loop()
+        loop.add_reader(self._master, self._readable)
+        try:
+            while True:
+                await self._answer(await self._commands.get())
+        finally:
+            loop.remove_reader(self._master)
+            self.close()
+
+    def close(self) -> None:
+        """Unplug the port; a second time does nothing."""
+        if not self._open:
+            return
+        self._open = False
+        os.close(self._master)
+        os.close(self._slave)
+        if self._link is not None and self._link.is_symlink() and str(self._link.readlink()) == self._tty:
+            self._link.unlink()
+
+    def reply_to(self, command: str, t_ns: int) -> bytes:
+        """The bytes the robot sends for a command line given at `t_ns` of the timeline."""
+        words = command.lower().split()
+        known = len(words) == 2 and "getrobotpos".startswith(words[0]) and "smooth".startswith(words[1])
+        # "getr" is the shortest abbreviation that only GetRobotPos can mean here.
+        if known and len(words[0]) >= len("getr"):
+            body = _pose_line(self._pose_at(t_ns), t_ns)
+        else:
+            body = f"Unknown Cmd: '{command}'"
+        return f"{command}\r\n{body}\r\n".encode("ascii", "replace") + _END_OF_REPLY
+
+    def _readable(self) -> None:
+        try:
+            data = os.read(self._master, 4096)
+        except BlockingIOError:
+            return
+        for byte in data:
+            if byte == ord("\n"):
+                self._commands.put_nowait(self._line.decode("ascii", "replace").rstrip("\r"))
+                self._line.clear()
+            elif len(self._line) < _MAX_LINE_BYTES:
+                self._line.append(byte)
+
+    async def _answer(self, command: str) -> None:
+        await asyncio.sleep(self._latency_s / 2)
+        reply = self.reply_to(command, time.monotonic_ns())
+        await asyncio.sleep(self._latency_s / 2)
+        # A serial line has no flow control: what nobody reads is lost.
+        with contextlib.suppress(BlockingIOError):
+            os.write(self._master, reply)
+        self.answered += 1
+
+
+def _pose_line(pose: Pose | None, t_ns: int) -> str:
+    x_m, y_m, yaw_rad = (0.0, 0.0, 0.0) if pose is None else pose
+    theta_deg = math.degrees(yaw_rad) % 360.0
+    return f"Robot Smooth pose: X={x_m:.3f}, Y={y_m:.3f}, Theta={theta_deg:.3f}, Time={t_ns / 1e9:.6f}"
