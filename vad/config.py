@@ -118,7 +118,7 @@ class CaptureSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     mapped_radius_m: 90 % region at which measuring stops; min_walks: at least as many walks.
     """
 
-    mapped_radius_m: Positive = 0.8
+    mapped_radius_m: Positive = 0.7
     min_walks: Annotated[int, Meta(ge=1)] = 2
     max_walks: Annotated[int, Meta(ge=1)] = 8
     min_s: Positive = 6.0

@@ -70,7 +70,7 @@ def doppler_posterior(
     model: DopplerModel | None = None,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> Posterior | None:
-    """The device's posterior from one walk under a flat prior over `grid`.
+    """The device's posterior from one walk, under a flat prior over `grid` but for the range (`_log_heard`).
 
     anchor_m: (2,) the known end of the link, map frame. None when `should_stop` asked to give up.
     """
@@ -106,7 +106,19 @@ def doppler_posterior(
     stacked = model.temper * np.array(scores)
     top = stacked.max()
     total = np.log(np.mean(np.exp(stacked - top), axis=0)) + top
+    total += _log_heard(points, walk)
     return Posterior(grid, (total - total.max()).reshape(grid.rows, grid.columns))
+
+
+def _log_heard(points_m: FloatArray, walk: WalkTrack) -> FloatArray:
+    """log of the mean over the walk of 1 / (d^2 + 1 m^2), d from candidate to walker; (G,).
+
+    The walker's echo falls with the square of its distance from the device: that it was heard speaks for
+    near candidates. Without it the answer depends on how far the map happens to reach (method.md 3).
+    """
+    places = walk.xy_m[:: max(1, len(walk.xy_m) // 100)]
+    squared = ((points_m[:, None] - places[None]) ** 2).sum(axis=2)
+    return np.asarray(np.log(np.mean(1 / (squared + 1), axis=1)))
 
 
 def _along(table: NDArray[np.float32], f_axis_hz: FloatArray, f_hz: FloatArray) -> FloatArray:

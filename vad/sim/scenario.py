@@ -239,9 +239,9 @@ def _farthest_corners(points: FloatArray, count: int, rng: np.random.Generator) 
 
 
 def _robot_sweep(points: FloatArray) -> FloatArray:
-    """A vacuum's lanes over the floor that the camera sees, 1 m apart, from x0 to x1."""
+    """A vacuum's lanes over the floor that the camera sees, 1.2 m apart, from x0 to x1."""
     lanes = []
-    for k, x in enumerate(np.arange(points[:, 0].min() + 0.1, points[:, 0].max(), 1.0)):
+    for k, x in enumerate(np.arange(points[:, 0].min() + 0.1, points[:, 0].max(), 1.2)):
         lane = points[np.abs(points[:, 0] - x) < 0.06]
         if len(lane) < 2:
             continue
@@ -299,7 +299,7 @@ def make_home(seed: int, *, walks: int = 12) -> Scenario:
         loop = np.roll(corners, -nearest, axis=0)
         visit = _smooth_walk(np.concatenate([door, loop, loop[:1], door]), start, rng, height)
         visits.append(visit)
-        start = visit.end_s + 5.0
+        start = visit.end_s + 4.0
     return Scenario(
         seed,
         room,
