@@ -4,21 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vad.capture.session import Session, load_session
+from vad.capture.session import Session, load_session, wrong_bounds
 from vad.errors import SessionError
 from vad.mapping.device_stage import (
     Evidence,
     PlaceEstimate,
+    Recording,
     evidence_from_walk,
-    joint_posterior,
     paper_estimate,
     place_from_posterior,
 )
+from vad.mapping.evidence import Terms
 from vad.mapping.posterior import Bounds, Grid
 from vad.mapping.walk import WalkTrack
 
@@ -26,6 +28,9 @@ FloatArray = NDArray[np.float64]
 
 GRID_STEP_M = 0.1
 PAPER_GRID_STEP_M = 0.2
+MAX_SPAN_S = 600.0
+"""A capture takes half a minute; times that are further apart are broken, and would only fill the memory."""
+
 MARGIN_WITHOUT_MAP_M = 4.0
 """A session without map bounds: the device is looked for this far around the walk and the anchor."""
 
@@ -103,17 +108,23 @@ def solve_session(
             remedy="Check clock.csi_first_packet_ns and the t_ns column",
         )
     anchor = np.array([header.anchor.x_m, header.anchor.y_m])
+    span_s = (int(session.t_ns[-1]) - int(session.t_ns[0])) / 1e9
+    if span_s > MAX_SPAN_S:
+        raise SessionError(f"the CSI spans {span_s:.0f} s, more than {MAX_SPAN_S:.0f} s", where=str(folder))
     bounds = bounds_m or bounds_of(session)
-    evidence = evidence_from_walk(
+    if wrong := wrong_bounds(bounds):
+        raise SessionError(f"no map to look for the device in: {wrong}", where=str(folder))
+    recording = Recording(
         session.t_ns,
         session.csi,
         walk,
         anchor,
-        Grid.over(bounds, GRID_STEP_M),
-        carrier_hz=header.radio.carrier_hz,
-        anchor_z_m=header.anchor.z_m,
-        should_stop=should_stop,
+        header.anchor.z_m,
+        header.radio.carrier_hz,
+        header.radio.bandwidth_mhz,
+        header.radio.array_end,
     )
+    evidence = evidence_from_walk(recording, Grid.over(bounds, GRID_STEP_M), should_stop=should_stop)
     if evidence.posterior is None or evidence.path is None:
         return Solved(session, evidence, None, None)
     paper_m = paper_estimate(evidence.path, walk, anchor, Grid.over(bounds, PAPER_GRID_STEP_M))
@@ -129,16 +140,14 @@ def fuse(solved: Sequence[Solved]) -> list[Fused]:
             key = (device.mac or device.name or one.session.header.id, one.session.header.map.epoch)
             groups.setdefault((*key, one.evidence.posterior.grid), []).append(one)
     results = []
-    for (device_id, _, _), members in groups.items():
-        posteriors = [m.evidence.posterior for m in members if m.evidence.posterior is not None]
-        total = posteriors[0]
-        for posterior in posteriors[1:]:
-            total = total.fused(posterior)
+    for (device_id, _, grid), members in groups.items():
+        terms = [m.evidence.terms for m in members if m.evidence.terms is not None]
+        total = reduce(Terms.plus, terms)
         results.append(
             Fused(
                 device_id,
                 tuple(m.session.header.id for m in members),
-                place_from_posterior(joint_posterior(total, len(posteriors))),
+                place_from_posterior(total.posterior(grid)),
                 members[0].session.truth_m,
             )
         )

@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from vad.mapping.device_stage import evidence_from_walk, place_from_posterior
+from vad.mapping.device_stage import ArrayEnd, Recording, evidence_from_walk, place_from_posterior
 from vad.mapping.doppler_likelihood import SPEED_OF_LIGHT_MPS, DopplerModel, predicted_doppler_hz
 from vad.mapping.posterior import Grid
 from vad.mapping.walk import WalkTrack
 from vad.sensing.path_length import path_length
-from vad.sensing.spectrogram import spectrogram_from_csi
+from vad.sensing.resample import antenna_ratio, to_uniform
+from vad.sensing.spectrogram import spectrogram
+from vad.sensing.template import moving_part
 
 CARRIER_HZ = 5.24e9
 WAVELENGTH_M = SPEED_OF_LIGHT_MPS / CARRIER_HZ
@@ -46,11 +48,18 @@ def made_csi(
     return t_ns, ((csi + 0.1 * noise) * common[:, None, None])[..., None].astype(np.complex64)
 
 
-@pytest.mark.parametrize("n_rx", [2, 3])
+def recording(
+    t_ns: NDArray[np.int64], csi: NDArray[np.complex64], walk: WalkTrack, array_end: ArrayEnd = "anchor"
+) -> Recording:
+    """The made packets say nothing of directions: their antennas stand at the known end."""
+    return Recording(t_ns, csi, walk, ANCHOR, carrier_hz=CARRIER_HZ, array_end=array_end)
+
+
+@pytest.mark.parametrize("n_rx", [1, 2, 3])
 def test_made_doppler_leads_to_the_device(n_rx: int) -> None:
     walk = circle_walk()
     t_ns, csi = made_csi(walk, DEVICE, n_rx=n_rx)
-    evidence = evidence_from_walk(t_ns, csi, walk, ANCHOR, GRID, carrier_hz=CARRIER_HZ)
+    evidence = evidence_from_walk(recording(t_ns, csi, walk), GRID)
     assert evidence.status == "located"
     assert evidence.posterior is not None
     place = place_from_posterior(evidence.posterior)
@@ -72,11 +81,11 @@ def test_the_known_end_may_send_or_receive() -> None:
 def test_the_ridge_follows_the_path_length() -> None:
     walk = circle_walk()
     t_ns, csi = made_csi(walk, DEVICE)
-    spectrogram = spectrogram_from_csi(t_ns, csi)
-    path = path_length(spectrogram, wavelength_m=WAVELENGTH_M)
+    spectra = spectrogram(to_uniform(t_ns, antenna_ratio(csi)))
+    path = path_length(spectra, wavelength_m=WAVELENGTH_M)
     model = DopplerModel(device_above_torso_m=0.8)
     true_hz = predicted_doppler_hz(
-        DEVICE[None], walk, ANCHOR, spectrogram.t_ns, wavelength_m=WAVELENGTH_M, model=model
+        DEVICE[None], walk, ANCHOR, spectra.t_ns, wavelength_m=WAVELENGTH_M, model=model
     )[:, 0]
     assert np.median(np.abs(path.f_hz - true_hz)) * WAVELENGTH_M < 0.1
     fast = np.abs(true_hz) > 8
@@ -87,11 +96,11 @@ def test_a_hole_in_the_packets_carries_no_weight() -> None:
     walk = circle_walk()
     t_ns, csi = made_csi(walk, DEVICE)
     keep = (t_ns < 5_000_000_000) | (t_ns > 7_000_000_000)
-    spectrogram = spectrogram_from_csi(t_ns[keep], csi[keep])
-    inside = (spectrogram.t_ns > 5_200_000_000) & (spectrogram.t_ns < 6_800_000_000)
-    assert np.all(spectrogram.weight[inside] == 0)
-    assert np.all(np.isfinite(spectrogram.log_likelihood))
-    evidence = evidence_from_walk(t_ns[keep], csi[keep], walk, ANCHOR, GRID, carrier_hz=CARRIER_HZ)
+    spectra = spectrogram(to_uniform(t_ns[keep], antenna_ratio(csi[keep])))
+    inside = (spectra.t_ns > 5_200_000_000) & (spectra.t_ns < 6_800_000_000)
+    assert np.all(spectra.weight[inside] == 0)
+    assert np.all(np.isfinite(spectra.log_likelihood))
+    evidence = evidence_from_walk(recording(t_ns[keep], csi[keep], walk), GRID)
     assert evidence.posterior is not None
 
 
@@ -100,14 +109,13 @@ def test_what_cannot_be_solved_is_refused_with_its_reason() -> None:
     t_ns, csi = made_csi(walk, DEVICE)
     still = WalkTrack(walk.t_ns, np.full_like(walk.xy_m, 2.0), walk.sigma_m)
     cases = [
-        (t_ns, csi[:, :, :1], walk, "one receive antenna"),
         (t_ns[:100], csi[:100], walk, "overlap"),
         (t_ns[::20], csi[::20], walk, "packets/s are too few"),
         (t_ns, csi, still, "moved 0.0 m only"),
         (t_ns[:0], csi[:0], walk, "no CSI packets"),
     ]
     for times, values, track, reason in cases:
-        evidence = evidence_from_walk(times, values, track, ANCHOR, GRID, carrier_hz=CARRIER_HZ)
+        evidence = evidence_from_walk(recording(times, values, track), GRID)
         assert evidence.status == "refused"
         assert reason in evidence.reason
         assert evidence.posterior is None
@@ -121,7 +129,7 @@ def test_a_straight_walk_is_not_a_confident_point() -> None:
         np.full(len(t_s), 0.03),
     )
     t_ns, csi = made_csi(straight, DEVICE)
-    evidence = evidence_from_walk(t_ns, csi, straight, ANCHOR, GRID, carrier_hz=CARRIER_HZ)
+    evidence = evidence_from_walk(recording(t_ns, csi, straight), GRID)
     assert evidence.status == "uncertain"
     assert "mirror" in evidence.reason
 
@@ -129,8 +137,62 @@ def test_a_straight_walk_is_not_a_confident_point() -> None:
 def test_asked_to_stop_it_stops() -> None:
     walk = circle_walk()
     t_ns, csi = made_csi(walk, DEVICE)
-    evidence = evidence_from_walk(
-        t_ns, csi, walk, ANCHOR, GRID, carrier_hz=CARRIER_HZ, should_stop=lambda: True
-    )
+    evidence = evidence_from_walk(recording(t_ns, csi, walk), GRID, should_stop=lambda: True)
     assert evidence.status == "refused"
     assert evidence.posterior is None
+
+
+def test_a_walk_with_late_stamps_is_put_right() -> None:
+    walk = circle_walk()
+    t_ns, csi = made_csi(walk, DEVICE)
+    late = WalkTrack(walk.t_ns + 300_000_000, walk.xy_m, walk.sigma_m)
+    errors = []
+    for track in (walk, late):
+        evidence = evidence_from_walk(recording(t_ns, csi, track), GRID)
+        assert evidence.posterior is not None
+        errors.append(np.linalg.norm(place_from_posterior(evidence.posterior).xy_m - DEVICE))
+    assert errors[1] < errors[0] + 0.15
+
+
+def test_the_antennas_of_the_device_tell_the_direction() -> None:
+    """Packets whose phases turn with the direction to the walker, as a device with antennas sees them."""
+    walk = circle_walk()
+    t_ns, _ = made_csi(walk, DEVICE)
+    position = walk.position_m(t_ns)
+    towards = (position - DEVICE) / np.linalg.norm(position - DEVICE, axis=1, keepdims=True)
+    places = np.array([[0.0, 0.0], [0.028, 0.0], [0.028, 0.028]])
+    length = np.sqrt(((position - ANCHOR) ** 2).sum(1) + 1.0)
+    length += np.sqrt(((position - DEVICE) ** 2).sum(1) + 0.64)
+    lead = towards @ places.T
+    rng = np.random.default_rng(3)
+    static = rng.normal(size=(30, 3)) + 1j * rng.normal(size=(30, 3))
+    f_hz = CARRIER_HZ + np.linspace(-8.75e6, 8.75e6, 30)
+    turn = -2j * np.pi / SPEED_OF_LIGHT_MPS
+    echo = np.exp(turn * f_hz[None, :, None] * (length[:, None] - lead)[:, None, :])
+    noise = rng.normal(size=echo.shape) + 1j * rng.normal(size=echo.shape)
+    values = (static + 0.3 * echo + 0.05 * noise).astype(np.complex64)[..., None]
+    spread = {}
+    ends: tuple[ArrayEnd, ArrayEnd] = ("device", "anchor")
+    for end in ends:
+        evidence = evidence_from_walk(recording(t_ns, values, walk, end), GRID)
+        assert evidence.posterior is not None
+        place = place_from_posterior(evidence.posterior)
+        assert np.linalg.norm(place.xy_m - DEVICE) < 0.5
+        spread[end] = place.radius90_m
+    assert spread["device"] < spread["anchor"]
+
+
+def test_what_stands_still_is_taken_out_and_what_moves_stays() -> None:
+    walk = circle_walk()
+    t_ns, csi = made_csi(walk, DEVICE)
+    moving = moving_part(csi)
+    assert moving.shape == csi.shape
+    still = np.repeat(csi[:1], 500, axis=0)
+    assert np.abs(moving_part(still)).max() < 1e-3
+    path = path_length(
+        spectrogram(to_uniform(t_ns, moving.reshape(len(moving), -1))), wavelength_m=WAVELENGTH_M
+    )
+    true_hz = predicted_doppler_hz(
+        DEVICE[None], walk, ANCHOR, path.t_ns, wavelength_m=WAVELENGTH_M, model=DopplerModel()
+    )[:, 0]
+    assert np.median(np.abs(path.f_hz - true_hz)) * WAVELENGTH_M < 0.12

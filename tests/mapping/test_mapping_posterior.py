@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vad.mapping.device_stage import joint_posterior, place_from_posterior
+from vad.mapping.device_stage import place_from_posterior
+from vad.mapping.evidence import joint_posterior
 from vad.mapping.posterior import Grid, Posterior
 
 GRID = Grid.over((-3.0, -2.0, 5.0, 4.0), 0.1)

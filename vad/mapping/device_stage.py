@@ -4,16 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vad.mapping.doppler_likelihood import SPEED_OF_LIGHT_MPS, DopplerModel, doppler_posterior
+from vad.mapping.arrival_likelihood import arrival_sums
+from vad.mapping.doppler_likelihood import (
+    SPEED_OF_LIGHT_MPS,
+    DopplerModel,
+    doppler_log_likelihood,
+    log_heard,
+)
+from vad.mapping.evidence import Terms
 from vad.mapping.paper import THRESHOLD_OFFICE_M, algorithm_1
 from vad.mapping.posterior import Grid, Posterior
 from vad.mapping.walk import WalkTrack
+from vad.sensing.arrival import ArrivalPhases, arrival_phases
 from vad.sensing.path_length import PathLength, path_length
-from vad.sensing.spectrogram import Spectrogram, spectrogram_from_csi
+from vad.sensing.resample import antenna_ratio, to_uniform
+from vad.sensing.spectrogram import Spectrogram, combined, spectrogram
+from vad.sensing.template import moving_part
 
 FloatArray = NDArray[np.float64]
 
@@ -25,11 +37,43 @@ MIN_WALK_M = 2.0
 MIN_BREADTH_M = 0.25
 """A straighter walk leaves the device's mirror image as likely as the device."""
 
-WALK_CORRELATION = 0.25
-"""Chosen on the plain-room recordings so that the 90 % region of 2 to 6 walks keeps its word."""
+SOLVE_STEP_M = 0.2
+"""Likelihoods are computed this finely and interpolated: no region is sharper than a few such steps."""
+
+OFFSETS_S = (-0.45, -0.3, -0.15, 0.0, 0.15, 0.3, 0.45)
+OFFSET_SIGMA_S = 0.25
+OFFSET_STEP_M = 0.5
+"""The time offset between camera and CSI is found on a grid this coarse, then held."""
 
 MAX_RADIUS90_M = 2.5
 """A wider 90 % region is no place."""
+
+
+ArrayEnd = Literal["device", "anchor"]
+"""Which end of the link has the receive antennas: the unknown one (the paper's layout) or the known one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """What one walk left behind.
+
+    t_ns (N,) strictly increasing; csi complex (N, 30, R, T); anchor_m (2,) the known end, map frame, its
+    height anchor_z_m where known; array_end: whose antennas the R rows are.
+    """
+
+    t_ns: NDArray[np.int64]
+    csi: NDArray[np.complex64]
+    walk: WalkTrack
+    anchor_m: FloatArray
+    anchor_z_m: float | None = None
+    carrier_hz: float = 5.24e9
+    bandwidth_mhz: int = 20
+    array_end: ArrayEnd = "device"
+
+    @property
+    def wavelength_m(self) -> float:
+        """Of the carrier."""
+        return SPEED_OF_LIGHT_MPS / self.carrier_hz
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,12 +81,13 @@ class Evidence:
     """What one walk says of the device.
 
     status: `located`; `uncertain` (a region too wide or double: shown, not to be trusted as a point);
-    `refused` (nothing can be said: posterior is None). reason: one sentence unless located.
+    `refused` (nothing can be said: posterior and terms are None). reason: one sentence unless located.
     """
 
     status: str
     reason: str
     posterior: Posterior | None
+    terms: Terms | None
     spectrogram: Spectrogram | None
     path: PathLength | None
 
@@ -60,50 +105,93 @@ class PlaceEstimate:
 
 
 def _refused(reason: str, spectrogram: Spectrogram | None = None) -> Evidence:
-    return Evidence("refused", reason, None, spectrogram, None)
+    return Evidence("refused", reason, None, None, spectrogram, None)
 
 
 def evidence_from_walk(
-    t_ns: NDArray[np.int64],
-    csi: NDArray[np.complex64],
-    walk: WalkTrack,
-    anchor_m: FloatArray,
+    recording: Recording,
     grid: Grid,
     *,
-    carrier_hz: float,
-    anchor_z_m: float | None = None,
     model: DopplerModel | None = None,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> Evidence:
-    """Solve one walk.
-
-    t_ns (N,) strictly increasing; csi complex (N, 30, R, T); anchor_m (2,) the known end, map frame.
-    """
-    reason = _unusable(t_ns, csi, walk)
+    """Solve one walk: Doppler of the whole spectrogram; where the device has the antennas, their phases."""
+    reason = _unusable(recording)
     if reason:
         return _refused(reason)
-    spectrogram = spectrogram_from_csi(t_ns, csi)
+    walk, wavelength_m = recording.walk, recording.wavelength_m
+    moving = moving_part(recording.csi, bandwidth_mhz=recording.bandwidth_mhz)
+    aligned = to_uniform(recording.t_ns, moving.reshape(len(moving), -1))
+    spectra = spectrogram(aligned)
+    antennas = recording.csi.shape[2]
+    if antennas > 1:
+        ratio = to_uniform(recording.t_ns, antenna_ratio(recording.csi))
+        spectra = combined(spectrogram(ratio), spectra)
     if should_stop():
-        return _refused("stopped before the end", spectrogram)
-    path = path_length(spectrogram, wavelength_m=SPEED_OF_LIGHT_MPS / carrier_hz)
-    posterior = doppler_posterior(
-        spectrogram,
+        return _refused("stopped before the end", spectra)
+    path = path_length(spectra, wavelength_m=wavelength_m)
+    phases = None
+    if antennas > 1 and recording.array_end == "device":
+        phases = arrival_phases(aligned, antennas, spectra.t_ns, path.f_hz)
+    solve = partial(_terms, recording, spectra, phases, model=model, should_stop=should_stop)
+    offset_s = _time_offset_s(solve, grid)
+    terms = None
+    if offset_s is not None:
+        terms = solve(Grid.over(grid.bounds_m, max(SOLVE_STEP_M, grid.step_m)), offset_s)
+    if terms is None:
+        return _refused("stopped before the end", spectra)
+    posterior = terms.posterior(grid)
+    if walk.breadth_m < MIN_BREADTH_M:
+        return Evidence(
+            "uncertain", "the walk was straight: a mirror image remains", posterior, terms, spectra, path
+        )
+    place = place_from_posterior(posterior)
+    return Evidence(place.status, place.reason, posterior, terms, spectra, path)
+
+
+def _terms(
+    recording: Recording,
+    spectra: Spectrogram,
+    phases: ArrivalPhases | None,
+    grid: Grid,
+    offset_s: float,
+    *,
+    model: DopplerModel | None,
+    should_stop: Callable[[], bool],
+) -> Terms | None:
+    """The evidence on `grid` if camera and CSI clocks differ by offset_s; None when asked to stop."""
+    points, walk = grid.points_m, recording.walk.later(offset_s)
+    doppler = doppler_log_likelihood(
+        spectra,
         walk,
-        anchor_m,
-        grid,
-        carrier_hz=carrier_hz,
-        anchor_z_m=anchor_z_m,
+        recording.anchor_m,
+        points,
+        wavelength_m=recording.wavelength_m,
+        anchor_z_m=recording.anchor_z_m,
         model=model,
         should_stop=should_stop,
     )
-    if posterior is None:
-        return _refused("stopped before the end", spectrogram)
-    if walk.breadth_m < MIN_BREADTH_M:
-        return Evidence(
-            "uncertain", "the walk was straight: a mirror image remains", posterior, spectrogram, path
-        )
-    place = place_from_posterior(posterior)
-    return Evidence(place.status, place.reason, posterior, spectrogram, path)
+    if doppler is None:
+        return None
+    sums = None
+    if phases is not None:
+        sums = arrival_sums(phases, walk, points, wavelength_m=recording.wavelength_m)
+    return Terms(grid, 1, doppler, log_heard(points, walk), sums)
+
+
+def _time_offset_s(solve: Callable[[Grid, float], Terms | None], grid: Grid) -> float | None:
+    """How much later the walk is than its stamps say: the posterior mean over a coarse grid of places."""
+    coarse = Grid.over(grid.bounds_m, max(OFFSET_STEP_M, grid.step_m))
+    weights = []
+    for offset_s in OFFSETS_S:
+        terms = solve(coarse, offset_s)
+        if terms is None:
+            return None
+        total = terms.log_density()
+        weights.append(np.log(np.sum(np.exp(total - total.max()))) + total.max())
+    log_weight = np.array(weights) - 0.5 * (np.array(OFFSETS_S) / OFFSET_SIGMA_S) ** 2
+    weight = np.exp(log_weight - log_weight.max())
+    return float(np.sum(weight * OFFSETS_S) / weight.sum())
 
 
 def place_from_posterior(posterior: Posterior) -> PlaceEstimate:
@@ -117,15 +205,6 @@ def place_from_posterior(posterior: Posterior) -> PlaceEstimate:
             f"the 90 % region is {radius:.1f} m wide in radius: more walks are needed",
         )
     return PlaceEstimate(status, reason, xy_m, covariance, radius, posterior.region_polygons_m(0.9))
-
-
-def joint_posterior(product: Posterior, walks: int) -> Posterior:
-    """The posterior from the product of `walks` walks' posteriors.
-
-    Walks through one room share their multipath and the walker's ways, so n walks count as
-    n / (1 + (n - 1) WALK_CORRELATION) independent ones.
-    """
-    return product.tempered(1 / (1 + (walks - 1) * WALK_CORRELATION))
 
 
 def paper_estimate(
@@ -144,12 +223,13 @@ def paper_estimate(
     return answer
 
 
-def _unusable(t_ns: NDArray[np.int64], csi: NDArray[np.complex64], walk: WalkTrack) -> str:
+def _unusable(recording: Recording) -> str:
     """Why these data cannot be solved; empty when they can."""
-    if len(t_ns) < 2 or len(walk.t_ns) < 2:
-        return "no CSI packets" if len(t_ns) < 2 else "the walk has fewer than two points"
-    if csi.shape[2] < 2:
-        return "one receive antenna only; two or more are needed to remove the radio's phase noise"
+    t_ns, walk = recording.t_ns, recording.walk
+    if len(t_ns) < 2:
+        return "no CSI packets"
+    if len(walk.t_ns) < 2:
+        return "the walk has fewer than two points"
     start, end = max(t_ns[0], walk.t_ns[0]), min(t_ns[-1], walk.t_ns[-1])
     overlap_s = (end - start) / 1e9
     if overlap_s < MIN_OVERLAP_S:

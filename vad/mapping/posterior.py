@@ -60,6 +60,15 @@ class Posterior:
         p = np.exp(self.log_density - self.log_density.max())
         return np.asarray(p / p.sum(), dtype=np.float64)
 
+    def on(self, grid: Grid) -> Posterior:
+        """The same on another grid of the same extent, by bicubic interpolation of the log-density."""
+        x = (grid.x0_m + grid.step_m * np.arange(grid.columns) - self.grid.x0_m) / self.grid.step_m
+        y = (grid.y0_m + grid.step_m * np.arange(grid.rows) - self.grid.y0_m) / self.grid.step_m
+        across, up = np.meshgrid(x.astype(np.float32), y.astype(np.float32))
+        source = self.log_density.astype(np.float32)
+        fine = cv2.remap(source, across, up, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        return Posterior(grid, np.asarray(fine, dtype=np.float64))
+
     def mean_and_covariance(self) -> tuple[FloatArray, FloatArray]:
         """Mean (2,) m and covariance (2, 2) m^2; a cell's own extent is counted in."""
         p, points = self.probability.ravel(), self.grid.points_m

@@ -38,6 +38,22 @@ class WalkTrack:
         base_s = np.minimum(at_s + _VELOCITY_BASE_S, t_s[-1]) - np.maximum(at_s - _VELOCITY_BASE_S, t_s[0])
         return np.asarray((ahead - behind) / np.maximum(base_s, 1e-3)[:, None], dtype=np.float64)
 
+    def later(self, offset_s: float) -> WalkTrack:
+        """The same walk, its stamps raised by offset_s."""
+        return WalkTrack(self.t_ns + int(offset_s * 1e9), self.xy_m, self.sigma_m)
+
+    def smoothed(self, window_s: float) -> WalkTrack:
+        """The track at 20 Hz under a Hann window of `window_s`: a walker's mass, not a detector's jitter."""
+        t_ns = np.arange(self.t_ns[0], self.t_ns[-1] + 1, 50_000_000)
+        width = max(1, round(window_s / 0.05)) | 1
+        kernel = np.hanning(width + 2)[1:-1]
+        kernel /= kernel.sum()
+        half = width // 2
+        padded = np.pad(self.position_m(t_ns), ((half, half), (0, 0)), mode="edge")
+        xy = np.stack([np.convolve(padded[:, k], kernel, mode="valid") for k in (0, 1)], axis=1)
+        t_s, at_s = self._seconds(t_ns)
+        return WalkTrack(t_ns, xy, np.interp(at_s, t_s, self.sigma_m))
+
     @property
     def length_m(self) -> float:
         """The way walked, measured over 0.5 s chords so that jitter does not count as walking."""

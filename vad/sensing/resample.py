@@ -38,11 +38,14 @@ def antenna_ratio(csi: NDArray[np.complex64]) -> NDArray[np.complex64]:
     base = csi[:, :, reference : reference + 1, :]
     tiny = np.float32(1e-3 * np.sqrt(np.mean(np.abs(base) ** 2)) + 1e-12)
     ratio = csi[:, :, others, :] * base.conj() / np.maximum(np.abs(base) ** 2, tiny**2)
-    flat = ratio.reshape(len(csi), -1)
-    modulus = np.abs(flat)
+    return without_outliers(ratio.reshape(len(csi), -1))
+
+
+def without_outliers(values: NDArray[np.complex64]) -> NDArray[np.complex64]:
+    """Values (N, ...) clipped in modulus at CLIP_MEDIANS times their stream's median over axis 0."""
+    modulus = np.abs(values)
     limit = CLIP_MEDIANS * np.median(modulus, axis=0, keepdims=True)
-    clipped = flat * np.minimum(1.0, limit / np.maximum(modulus, 1e-12))
-    return np.asarray(clipped, dtype=np.complex64)
+    return np.asarray(values * np.minimum(1.0, limit / np.maximum(modulus, 1e-12)), dtype=np.complex64)
 
 
 def to_uniform(t_ns: NDArray[np.int64], values: NDArray[np.complex64]) -> UniformStreams:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vad.sensing.resample import RATE_HZ, UniformStreams, antenna_ratio, to_uniform
+from vad.sensing.resample import RATE_HZ, UniformStreams
 
-WINDOW_S = 0.35
+WINDOW_S = 0.4
 HOP_S = 0.05
 MAX_DOPPLER_HZ = 60.0
 SMOOTHING_HZ = 1.5
@@ -36,9 +36,15 @@ class Spectrogram:
     weight: NDArray[np.float64]
 
 
-def spectrogram_from_csi(t_ns: NDArray[np.int64], csi: NDArray[np.complex64]) -> Spectrogram:
-    """CSI complex (N, 30, R >= 2, T) at increasing t_ns (N,) -> Spectrogram by the antenna ratio."""
-    return spectrogram(to_uniform(t_ns, antenna_ratio(csi)))
+def combined(first: Spectrogram, second: Spectrogram) -> Spectrogram:
+    """Two views of the same frames: the mean of their powers and of their log-likelihoods."""
+    return Spectrogram(
+        first.t_ns,
+        first.f_hz,
+        (first.power + second.power) / 2,
+        (first.log_likelihood + second.log_likelihood) / 2,
+        np.minimum(first.weight, second.weight),
+    )
 
 
 def spectrogram(streams: UniformStreams) -> Spectrogram:
