@@ -72,6 +72,52 @@ def test_a_reset_counter_is_found(restarted_at: int) -> None:
     assert np.abs(out - (BASE_NS + (second * 1e9).astype(np.int64))).max() < 1_000_000
 
 
+@pytest.mark.parametrize("moved_s", [-4.9, -3.0, -1.5, -0.7, -0.12, 0.12, 0.5, 0.95, 1.5])
+@pytest.mark.parametrize("pause_s", [0.0, 7.0])
+def test_a_small_jump_of_the_counter_does_not_go_unnoticed(moved_s: float, pause_s: float) -> None:
+    """moved_s: how far the counter then is ahead (packets seem early, +) or behind (late, -)."""
+    rng = np.random.default_rng(3)
+    clock = ClockMap()
+    t_s = np.concatenate([np.arange(0, 20, 0.002), 20 + pause_s + np.arange(0, 20, 0.002)])
+    late = t_s >= 20
+    counter_s = t_s + np.where(late, moved_s, 0.0)
+    out = drive(clock, t_s, counter_of(counter_s, 3_000_000_000, 20e-6), rng)
+    error = out - (BASE_NS + (t_s * 1e9).astype(np.int64))
+    assert clock.restarts == 1
+    settled = t_s > 20 + pause_s + (3.0 if moved_s < 0 else 0.1)
+    assert np.abs(error[settled]).max() < 1_000_000
+    assert np.abs(error[~late]).max() < 1_000_000
+
+
+def test_a_stalling_receiver_is_no_reset() -> None:
+    """400 ms in every second nothing is read; then all of it, and the last packet is in time."""
+    clock = ClockMap()
+    t_s = np.arange(0, 60, 0.0004)
+    counter = counter_of(t_s, 5, 30e-6)
+    read_s = np.concatenate([k + np.concatenate([[0.4], np.arange(0.42, 1.0, 0.02)]) for k in range(60)])
+    first = 0
+    for now_s in read_s:
+        end = int(np.searchsorted(t_s, now_s))
+        clock.update(counter[first:end], np.full(end - first, BASE_NS + int(now_s * 1e9)))
+        first = end
+    assert clock.restarts == 0
+    assert clock.skew == pytest.approx(-30e-6, abs=15e-6)  # a packet comes every 0.4 ms
+
+
+def test_a_counter_that_stands_still_gives_arrival_times() -> None:
+    clock = ClockMap()
+    for k in range(100):
+        arrival = np.full(5, BASE_NS + k * 20_000_000)
+        out = clock.update(np.full(5, 77, np.uint32), arrival)
+        assert clock.still == (k >= 2)
+        if clock.still:
+            assert (out == arrival).all()
+    moving = clock.update(np.array([1000, 2000], np.uint32), np.full(2, BASE_NS + 2_000_000_000))
+    assert not clock.still
+    assert clock.restarts == 1
+    assert (moving - BASE_NS).tolist() == [1_999_000_000, 2_000_000_000]
+
+
 def test_wraps_while_nothing_came_are_counted_by_arrival() -> None:
     rng = np.random.default_rng(1)
     clock = ClockMap()

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Feeds mutated CSI logs and connector messages to the parsers; any exception but theirs is a bug.
+"""Feeds mutated CSI logs, messages and echo replies to the parsers; any exception but theirs is a bug.
 
 Usage: tools/fuzz_csi.py [INPUTS] [SEED]
 """
@@ -17,8 +17,13 @@ from vad.csi import cn
 from vad.csi.attribution import Attribution
 from vad.csi.bfee import encode_bodies
 from vad.csi.dot11 import data_frame
-from vad.csi.logfile import LogReader, read_log, record
+from vad.csi.echo import echo_request, reply_sequence
+from vad.csi.heard import HeardStations
+from vad.csi.intake import Intake
+from vad.csi.logfile import read_log, record
+from vad.csi.summary import summarise
 from vad.errors import ProtocolError
+from vad.health import Health
 
 
 def seeds() -> list[bytes]:
@@ -51,28 +56,41 @@ def main() -> None:
     inputs = int(sys.argv[1]) if len(sys.argv) > 1 else 100_000
     rng = random.Random(int(sys.argv[2]) if len(sys.argv) > 2 else 0)
     logs = seeds()
-    endless = LogReader(Attribution())
+    health = Health("fuzz")
+    endless, heard = Intake(health, None), HeardStations()
+    reply = bytes((0x45,)) + bytes(19) + b"\0" + echo_request(7, 7, bytes(56))[1:]
     packets = refused = 0
+    slowest_s = 0.0
     started, warm_kib = time.monotonic(), 0
     for i in range(inputs):
         log = mutate(rng.choice(logs), rng)
-        which = i % 3
+        which = i % 4
+        began = time.monotonic()
         if which == 0:
-            packets += read_log(log, Attribution())[1].packets
+            packets += summarise(log).packets if i % 40 == 0 else read_log(log, Attribution())[1].packets
         elif which == 1:
-            packets += len(endless.feed(log).packets)
+            batch = endless.feed(log, 1_000_000 * i, None)
+            packets += len(batch.packets)
+            heard.take(batch, 1_000_000 * i)
+        elif which == 2:
+            try:
+                reply_sequence(mutate(reply, rng), 7)
+            except ProtocolError:
+                refused += 1
         else:
             message = mutate(cn.build_message(0xBB, log), rng)
             try:
                 cn.payload_bytes(message, len(message), cn.IWLAGN_GROUP, cn.IWLAGN_VALUE)
             except ProtocolError:
                 refused += 1
+        slowest_s = max(slowest_s, time.monotonic() - began)
         if i == inputs // 10:
             warm_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     grown_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - warm_kib
     print(
         f"{inputs} inputs in {time.monotonic() - started:.0f} s: {packets} packets, "
-        f"{refused} messages refused, memory grew by {grown_kib} KiB after the first tenth"
+        f"{refused} messages refused, slowest {slowest_s * 1e3:.1f} ms, "
+        f"memory grew by {grown_kib} KiB after the first tenth"
     )
 
 

@@ -1,49 +1,17 @@
-"""The command line: `vad COMMAND --help` teaches each."""
+"""The console script. SIGINT and SIGTERM wait until what the command needs is imported.
+
+That takes about a second; whoever changes his mind then gets an ordinary end, not a traceback out of
+somebody's import.
+"""
 
 from __future__ import annotations
 
-import typer
-
-from vad import __version__
-from vad.commands.demo import demo
-from vad.commands.devices import devices
-from vad.commands.map import map_
-from vad.commands.replay import replay
-from vad.commands.run import check_config, run
-from vad.commands.sim import sim
-from vad.commands.status import status
-
-app = typer.Typer(
-    name="vad",
-    help="Puts every Wi-Fi device of a home on the robot vacuum's floor plan.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
-    epilog="Try it without any hardware:  vad demo",
-)
-
-
-def _version(wanted: bool) -> None:
-    if wanted:
-        typer.echo(__version__)
-        raise typer.Exit
-
-
-@app.callback()
-def _vad(version: bool = typer.Option(False, "--version", callback=_version, is_eager=True)) -> None:
-    pass
-
-
-app.command()(run)
-app.command("check-config")(check_config)
-app.command()(devices)
-app.command("map")(map_)
-app.command()(status)
-app.command()(replay)
-app.command()(demo)
-app.command()(sim)
+import signal
 
 
 def main() -> None:
-    """The console script."""
+    """Run the command line; see vad.commands.app."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
+    from vad.commands.app import app
+
     app()

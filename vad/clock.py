@@ -19,8 +19,15 @@ _SKEW_SPAN_US = 10_000_000
 _MAX_SKEW = 500e-6
 _SLEW = 0.01
 _STEP_NS = 100_000_000
-_RESTART_EARLY_NS = 1_000_000_000
-_RESTART_LATE_NS = 5_000_000_000
+# What jitter cannot explain: the least delays of a living receiver differ by far less.
+_JUMP_NS = 50_000_000
+# How far two clocks may have drifted apart while nothing came and the skew was not known.
+_DRIFT = 100e-6
+# A stall of the receiver ends with packets in time; what stays late for so long was set back.
+_LATE_NS = 2_000_000_000
+_TOO_LATE_NS = 5_000_000_000
+# A counter that says the same so often in a row does not count.
+_STILL_PACKETS = 10
 
 
 def unwrap_nic_us(nic_us: NDArray[np.uint32]) -> NDArray[np.int64]:
@@ -44,14 +51,19 @@ class ClockMap:
     all delays of the last two minutes is the map: its slope is the skew (lower convex hull, the edge over
     the mean time), its height the smallest delay. Jitter of arrival disappears; a constant least delay
     stays in. Corrections are slewed in by at most 1 %, so that intervals keep their length; one of more
-    than 0.1 s is a step. The counter's wraps are resolved, across long pauses by the arrival times. A
-    counter that disagrees with the line by 1 s (early) or 5 s (late) was reset: the map starts anew.
+    than 0.1 s is a step. The counter's wraps are resolved, across long pauses by the arrival times.
+
+    A counter that leaves the line was reset, and the map starts anew: at once where packets come more than
+    50 ms before the line (nothing arrives before it was sent) or more than 5 s after it; where all of
+    them come more than 50 ms after it, once that has lasted for 2 s, as no stall does. A counter that does
+    not advance cannot be mapped: the arrival times themselves are handed out until it does.
 
     Output rises with the counter, except across a step or a restart.
 
     Attributes:
         restarts: how often the map started anew.
         skew: rate of the timeline against the counter, minus 1.
+        still: True while the counter does not advance.
     """
 
     def __init__(self) -> None:
@@ -60,28 +72,54 @@ class ClockMap:
         self._lowest: deque[tuple[int, int]] = deque()  # counter us, smallest delay ns of each bin
         self._height_ns = 0.0  # delay of the line at self._pivot_us
         self._pivot_us = 0
-        self._last_counter = 0
+        self._last_counter: int | None = None
         self._last_us = 0
         self._last_arrival_ns = 0
+        self._late_since_ns: int | None = None
+        self._repeats = 0  # packets in a row with the last counter value, after the first of them
         self._out: tuple[int, int] | None = None  # counter us, time ns: the end of what was handed out
+
+    @property
+    def still(self) -> bool:
+        return self._repeats >= _STILL_PACKETS
 
     def update(self, counter: NDArray[np.uint32], arrival_ns: NDArray[np.int64]) -> NDArray[np.int64]:
         """The times of the next counter values (N,), which arrived at `arrival_ns` (N,); int64 ns (N,)."""
         if not len(counter):
             return np.zeros(0, np.int64)
+        if self._stands_still(counter):
+            return arrival_ns.copy()
         us = self._unwrap(counter, int(arrival_ns[0]))
-        self._last_counter, self._last_us = int(counter[-1]), int(us[-1])
-        self._last_arrival_ns = int(arrival_ns[-1])
         delay = arrival_ns - us * TICK_NS
-        best = int(np.argmin(delay - self._line(us)))
-        self._learn(int(us[best]), int(delay[best]))
+        best = int((delay - self._line(us)).argmin())
+        self._learn(int(us[best]), int(delay[best]), int(arrival_ns[-1]))
+        self._last_us = int(us[-1])
+        self._last_arrival_ns = int(arrival_ns[-1])
         return self._apply(us)
+
+    def _stands_still(self, counter: NDArray[np.uint32]) -> bool:
+        """Count repeated values; a counter that moves again after it stood still starts a new map."""
+        was_still, last = self.still, int(counter[-1])
+        if (counter == last).all():
+            self._repeats = self._repeats + len(counter) if last == self._last_counter else len(counter) - 1
+        else:
+            self._repeats = 0
+        self._last_counter = last
+        if was_still and not self.still:
+            self._restart()
+        return self.still
+
+    def _restart(self) -> None:
+        self.restarts += 1
+        self._lowest.clear()
+        self._late_since_ns = None
+        self._out = None
 
     def _unwrap(self, counter: NDArray[np.uint32], arrival_ns: int) -> NDArray[np.int64]:
         us = unwrap_nic_us(counter)
         if self._out is None:
             return us
-        step = (int(us[0]) - self._last_counter) % COUNTER_RANGE
+        step = (int(us[0]) - self._last_us) % COUNTER_RANGE
         if step > COUNTER_RANGE - _REORDER_US:
             step -= COUNTER_RANGE
         paused_us = (arrival_ns - self._last_arrival_ns) / TICK_NS
@@ -92,16 +130,15 @@ class ClockMap:
         """Delay of the fitted line in ns."""
         return (us - self._pivot_us).astype(np.float64) * (TICK_NS * self.skew) + self._height_ns
 
-    def _learn(self, us: int, delay_ns: int) -> None:
-        if self._lowest:
-            above_ns = delay_ns - float(self._line(np.array([us]))[0])
-            if not -_RESTART_EARLY_NS <= above_ns <= _RESTART_LATE_NS:
-                self.restarts += 1
-                self._lowest.clear()
-                self._out = None
+    def _learn(self, us: int, delay_ns: int, now_ns: int) -> None:
+        if self._lowest and self._was_reset(us, delay_ns, now_ns):
+            self._restart()
         if self._lowest and us // _BIN_US == self._lowest[-1][0] // _BIN_US:
-            if delay_ns < self._lowest[-1][1]:
-                self._lowest[-1] = (us, delay_ns)
+            if delay_ns >= self._lowest[-1][1]:
+                self._height_ns += (us - self._pivot_us) * TICK_NS * self.skew
+                self._pivot_us = us
+                return
+            self._lowest[-1] = (us, delay_ns)
         else:
             self._lowest.append((us, delay_ns))
             while us - self._lowest[0][0] > _WINDOW_US:
@@ -110,6 +147,17 @@ class ClockMap:
         times, delays = np.array(self._lowest, np.int64).T
         self._pivot_us = us
         self._height_ns = float((delays - (times - us) * (TICK_NS * self.skew)).min())
+
+    def _was_reset(self, us: int, delay_ns: int, now_ns: int) -> bool:
+        """Whether the least delay of a batch contradicts the line."""
+        above_ns = delay_ns - (us - self._pivot_us) * TICK_NS * self.skew - self._height_ns
+        jump_ns = _JUMP_NS + _DRIFT * abs(us - self._pivot_us) * TICK_NS
+        if above_ns <= jump_ns:
+            self._late_since_ns = None
+            return above_ns < -jump_ns
+        if self._late_since_ns is None:
+            self._late_since_ns = now_ns
+        return above_ns > _TOO_LATE_NS or now_ns - self._late_since_ns >= _LATE_NS
 
     def _fit_skew(self) -> float:
         points = self._lowest

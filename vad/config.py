@@ -15,12 +15,60 @@ Positive = Annotated[float, Meta(gt=0)]
 Id = Annotated[str, Meta(pattern="^[A-Za-z0-9_-]{1,64}$")]
 MacText = Annotated[str, Meta(pattern="^[0-9A-Fa-f]{2}(:[0-9A-Fa-f]{2}){5}$")]
 
+Ipv4Text = Annotated[str, Meta(pattern=r"^((25[0-5]|2[0-4]\d|1?\d?\d)(\.(?!$)|$)){4}$")]
+
 
 class NeatoRobot(msgspec.Struct, tag="neato", frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Neato Botvac D3-D7 over serial. port: device path, pty, socket:// or rfc2217:// URL."""
+    """Neato Botvac D3-D7 over serial. port: device path, pty, socket:// or rfc2217:// URL.
+
+    lidar: ask for laser scans, too, and draw the floor plan from them.
+    """
 
     port: str
     rate_hz: Positive = 5.0
+    lidar: bool = False
+
+
+class Ros2Robot(msgspec.Struct, tag="ros2", frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A ROS 2 robot over zenoh (rmw_zenoh or zenoh-bridge-ros2dds).
+
+    endpoint: its zenoh router, e.g. tcp/192.168.1.20:7447; left out: what is connected to the hub's own.
+    style: the kind of keys, both if left out. pose: `tf` (map -> odom -> base), else pose_topic carries
+    `pose` (PoseStamped), `pose_covariance` (AMCL) or `odometry`. A topic that begins with a slash ignores
+    the namespace.
+    """
+
+    endpoint: str | None = None
+    namespace: str = ""
+    domain: Annotated[int, Meta(ge=0, le=232)] = 0
+    style: Literal["rmw_zenoh", "bridge", "both"] = "both"
+    pose: Literal["tf", "pose", "pose_covariance", "odometry"] = "tf"
+    pose_topic: str = ""
+    map_topic: str = "map"
+    map_frame: str = "map"
+    base_frames: tuple[str, ...] = ("base_footprint", "base_link")
+
+
+class ValetudoRobot(msgspec.Struct, tag="valetudo", frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A robot with Valetudo. url: its address, e.g. http://192.168.1.30 (user:password@ where it wants one);
+    or key: the zenoh key that its MapData/map-data is relayed to."""
+
+    url: str | None = None
+    key: str | None = None
+
+
+class RoombaRobot(msgspec.Struct, tag="roomba", frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Roomba or Create 2 over serial: wheel counts only, from where it stands when the daemon starts."""
+
+    port: str
+    baud: Annotated[int, Meta(gt=0)] = 115_200
+
+
+class LineRobot(msgspec.Struct, tag="serial-json", frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A home-made robot that writes lines of JSON with a checksum (vad/robot/json_line.py)."""
+
+    port: str
+    baud: Annotated[int, Meta(gt=0)] = 115_200
 
 
 class ZenohRobot(msgspec.Struct, tag="zenoh-json", frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -75,19 +123,26 @@ class FollowCsi(msgspec.Struct, tag="follow", frozen=True, forbid_unknown_fields
 
 
 class RadioSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The hub's CSI radio. antenna_offset_m: where its antennas are from the camera, along the map's axes."""
+    """The hub's CSI radio. antenna_offset_m: where its antennas are from the camera, along the map's axes.
+
+    transmitter: whose all packets are, where the card is no access point (client mode: the AP's address);
+    traffic_packets_per_s: echo requests to the device under measurement, if its IP is known; 0 = none.
+    """
 
     source: ConnectorCsi | FollowCsi = ConnectorCsi()
+    transmitter: MacText | None = None
+    traffic_packets_per_s: Annotated[float, Meta(ge=0, le=2000)] = 400.0
     carrier_hz: Positive = 5.24e9
     bandwidth_mhz: Literal[20, 40] = 20
     antenna_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 class StaticDevice(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A device that is known without a join event."""
+    """A device that is known without a join event. ip: where echo requests make it send."""
 
     mac: MacText
     name: str | None = None
+    ip: Ipv4Text | None = None
 
 
 class DeviceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -99,10 +154,15 @@ class DeviceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
 
 class MapSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The floor plan. file: a map_server YAML beside its picture; epoch: raise it when the map changes."""
+    """The floor plan. file: a map_server YAML beside its picture; left out: the robot's own map.
 
-    file: str
+    epoch: of the file; raise it when the map changes. rooms: a YAML with `rooms: [{name, polygon_m}]`, for
+    maps that have none.
+    """
+
+    file: str | None = None
     epoch: Annotated[int, Meta(ge=0)] = 1
+    rooms: str | None = None
 
 
 class BusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -133,6 +193,9 @@ class VisionSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     threads: Annotated[int, Meta(ge=1, le=16)] = 1
 
 
+RobotSettings = NeatoRobot | ZenohRobot | Ros2Robot | ValetudoRobot | RoombaRobot | LineRobot
+
+
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """vad.yaml.
 
@@ -140,11 +203,11 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     state_dir: database and session folders.
     """
 
-    map: MapSettings
-    robot: NeatoRobot | ZenohRobot
+    robot: RobotSettings
     camera: CameraSettings
     radio: RadioSettings
     devices: DeviceSettings
+    map: MapSettings = MapSettings()
     hub: Id = "home"
     source: Literal["live", "simulated"] = "live"
     state_dir: str = "/var/lib/vad"
@@ -164,10 +227,34 @@ def parse_settings(text: str, *, where: str) -> Settings:
     if not isinstance(raw, dict):
         raise ConfigError("the file holds no settings", where=where, remedy="See config/vad.yaml")
     try:
-        return msgspec.convert(raw, type=Settings, strict=False)  # YAML 1.1 reads 5.24e9 as text
+        settings = msgspec.convert(raw, type=Settings, strict=False)  # YAML 1.1 reads 5.24e9 as text
     except msgspec.ValidationError as error:
         what, _, path = str(error).partition(" - at ")
         raise ConfigError(what, where=f"{where}: {path.strip('`') or '$'}") from error
+    _check_robot(settings, where)
+    return settings
+
+
+def brings_map(robot: RobotSettings) -> bool:
+    """Whether this robot sends its own floor plan."""
+    return isinstance(robot, Ros2Robot | ValetudoRobot) or (isinstance(robot, NeatoRobot) and robot.lidar)
+
+
+def _check_robot(settings: Settings, where: str) -> None:
+    robot = settings.robot
+    if settings.map.file is None and not brings_map(robot):
+        raise ConfigError(
+            "there is no floor plan: this robot brings none",
+            where=f"{where}: $.map.file",
+            remedy="Name a map_server YAML; `vad map import` makes one from other maps",
+        )
+    if isinstance(robot, ValetudoRobot) and (robot.url is None) == (robot.key is None):
+        raise ConfigError("give either url or key", where=f"{where}: $.robot")
+    if isinstance(robot, Ros2Robot) and (robot.pose == "tf") != (not robot.pose_topic):
+        raise ConfigError(
+            "pose_topic goes with pose: pose, pose_covariance or odometry",
+            where=f"{where}: $.robot.pose_topic",
+        )
 
 
 def load_settings(path: Path) -> Settings:

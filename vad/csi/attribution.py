@@ -16,6 +16,19 @@ AFTER_LOSS = "after_loss"
 LEGACY_FRAME = "legacy_frame"
 
 
+def count_steps(bfee_count: NDArray[np.uint16], before: int | None) -> NDArray[np.uint16]:
+    """By how much each count (N,) is ahead of the one before it, modulo 2^16; 1 where none is missing.
+
+    Args:
+        before: the count before the first; None where there was none, which is no gap.
+    """
+    step = np.ones(len(bfee_count), np.uint16)
+    np.subtract(bfee_count[1:], bfee_count[:-1], out=step[1:])
+    if before is not None:
+        step[0] = (int(bfee_count[0]) - before) & 0xFFFF
+    return step
+
+
 class Attribution:
     """Gives every CSI packet its transmitter, batch after batch of one stream of records.
 
@@ -69,11 +82,13 @@ class Attribution:
         paired = np.flatnonzero((codes == FRAME_CODE) | (codes == BFEE_CODE))
         if not len(paired):
             return np.zeros(0, np.int64)
-        before = np.roll(paired, 1)  # the record before each; the first one is corrected below
-        has_frame = codes[before] == FRAME_CODE
-        owner = sender[before]
+        # What the record before each one is; the last batch's open frame stands before the first.
+        has_frame = np.empty(len(paired), np.bool_)
+        owner = np.empty(len(paired), np.int64)
         has_frame[0] = self._open_frame is not None
         owner[0] = UNKNOWN_MAC if self._open_frame is None else self._open_frame
+        np.equal(codes[paired[:-1]], FRAME_CODE, out=has_frame[1:])
+        owner[1:] = sender[paired[:-1]]
         last = paired[-1]
         self._open_frame = int(sender[last]) if codes[last] == FRAME_CODE else None
 
@@ -81,9 +96,8 @@ class Attribution:
             return np.zeros(0, np.int64)
         place = np.searchsorted(paired, packets)
         mac, has_frame = owner[place], has_frame[place]
-        step = np.diff(bfee_count, prepend=bfee_count[:1] if self._count is None else np.uint16(self._count))
-        gap = step != 1
-        gap[0] = self._lost or (gap[0] and self._count is not None)
+        gap = count_steps(bfee_count, self._count) != 1
+        gap[0] |= self._lost
         self._count, self._lost = int(bfee_count[-1]), False
         mac[gap] = UNKNOWN_MAC
         for reason, hit in (

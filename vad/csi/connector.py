@@ -11,9 +11,8 @@ import time
 
 from vad.csi import cn
 from vad.csi.attribution import Attribution
-from vad.csi.logfile import LogReader
+from vad.csi.intake import Intake
 from vad.csi.packets import CsiBatch
-from vad.csi.stamping import Stamper
 from vad.errors import ProtocolError
 from vad.health import Health
 from vad.streams import DropOldestQueue
@@ -23,6 +22,9 @@ log = logging.getLogger(__name__)
 RETRY_S = 5.0
 # Waking once per message costs ten times the work of the messages; the clock map takes the wait out again.
 COALESCE_S = 0.020
+# A batch costs as much as some hundred of its packets: a busy source is left alone for longer.
+BUSY_MESSAGES = 100
+BUSY_COALESCE_S = 0.080
 RECEIVE_BUFFER_BYTES = 4 << 20
 # One drain decodes at most this many messages before the event loop gets its turn.
 DRAIN_MESSAGES = 2048
@@ -43,9 +45,8 @@ class Connector:
         allow_user_space: take messages that a process sent, not the kernel: tests and simulation only.
         receive_buffer_bytes: asked of the kernel, which doubles it; without CAP_NET_ADMIN it may give less.
 
-    `health.counters`: messages, packets, dropped (by the kernel, exact), overruns, user_space (refused
-    senders), refused messages by reason, bad_<reason> records, unattributed_<reason>
-    packets (vad.csi.attribution), clock_restarts.
+    `health.counters`: messages, dropped (by the kernel, exact), overruns, user_space (refused senders),
+    refused messages by reason, and those of vad.csi.intake.
     """
 
     def __init__(
@@ -60,11 +61,9 @@ class Connector:
         self.health = Health("csi.connector")
         self._group = group
         self._value = value
-        self._attribution = attribution or Attribution()
         self._allow_user_space = allow_user_space
         self._receive_buffer_bytes = receive_buffer_bytes
-        self._reader = LogReader(self._attribution)
-        self._stamper = Stamper()
+        self._intake = Intake(self.health, attribution)
         self._buffer = bytearray(_MESSAGE_BYTES)
         self._view = memoryview(self._buffer)
         self._drops_seen = 0
@@ -101,22 +100,26 @@ class Connector:
             sock.close()
             raise
         self._drops_seen = 0
-        self._attribution.mark_loss()
+        self._intake.mark_loss()
         return sock
 
     async def _receive(self, sock: socket.socket, out: DropOldestQueue[CsiBatch]) -> None:
         loop = asyncio.get_running_loop()
+        coalesce_s = COALESCE_S
         while True:
             woken: asyncio.Future[int] = loop.create_future()
-            loop.add_reader(sock, _wake, woken)
+            loop.add_reader(sock.fileno(), _wake, woken)
             try:
                 woken_ns: int | None = await woken
             finally:
-                loop.remove_reader(sock)
-            await asyncio.sleep(COALESCE_S)
+                loop.remove_reader(sock.fileno())
+            await asyncio.sleep(coalesce_s)
+            before = self.health.counters["messages"]
             while self._drain(sock, out, woken_ns):
                 woken_ns = None
                 await asyncio.sleep(0)
+            busy = self.health.counters["messages"] - before >= BUSY_MESSAGES
+            coalesce_s = BUSY_COALESCE_S if busy else COALESCE_S
 
     def _drain(self, sock: socket.socket, out: DropOldestQueue[CsiBatch], woken_ns: int | None) -> bool:
         """Take what waits, at most DRAIN_MESSAGES; True when there may be more."""
@@ -152,30 +155,16 @@ class Connector:
             raw += view[cn.HEADER_BYTES : cn.HEADER_BYTES + size]
         drained_ns = time.monotonic_ns()
         counters["messages"] += messages
-        self._emit(bytes(raw), out, drained_ns, woken_ns)
+        if raw:
+            out.put(self._intake.feed(bytes(raw), drained_ns, woken_ns))
         self._count_drops(sock)
         if emptied and self._loss_ahead:
             # An overrun socket takes nothing until it is empty: what is missing would have come now.
-            self._attribution.mark_loss()
+            self._intake.mark_loss()
             self._loss_ahead = False
         if self.health.state == "degraded" and drained_ns - self._trouble_ns > RECOVERED_S * 1e9:
             self._listening()
         return not emptied
-
-    def _emit(
-        self, raw: bytes, out: DropOldestQueue[CsiBatch], drained_ns: int, woken_ns: int | None
-    ) -> None:
-        if not raw:
-            return
-        batch = self._stamper.stamp(self._reader.feed(raw), drained_ns, woken_ns)
-        counters = self.health.counters
-        counters["packets"] += len(batch.packets)
-        counters["clock_restarts"] = self._stamper.clock.restarts
-        for reason, n in self._reader.stats.bad.items():
-            counters[f"bad_{reason}"] = n
-        for reason, n in self._attribution.unknown.items():
-            counters[f"unattributed_{reason}"] = n
-        out.put(batch)
 
     def _count_drops(self, sock: socket.socket) -> None:
         memory = sock.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _SK_MEMINFO.size)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ INJECTED_MAC = 0x0016_EA12_3456
 """The constant address which the CSI Tool's injection puts into addr1 and addr2."""
 
 _MAC_HEADER_BYTES = 24
+_TWO_ADDRESSES_BYTES = 16
 _BYTE_WEIGHTS = 1 << np.arange(40, -8, -8, dtype=np.int64)
 
 
@@ -43,6 +45,42 @@ def transmitters(buffer: Bytes, offsets: NDArray[np.int64], lengths: NDArray[np.
     injected = (addr2 == INJECTED_MAC) & (frame[:, 16] & 1 == 0)
     mac[whole] = np.where(carries_csi, np.where(injected, addr3, addr2), UNKNOWN_MAC)
     return mac
+
+
+@dataclass(frozen=True, slots=True)
+class FrameFacts:
+    """What F frames say of themselves, whatever they were sent for.
+
+    sender: int64 (F,) addr2; UNKNOWN_MAC where there is none (ACK, CTS, frames that are cut short).
+    is_data: bool (F,) a data frame with a payload; is_protected: bool (F,) its payload is encrypted.
+    """
+
+    sender: NDArray[np.int64]
+    is_data: NDArray[np.bool_]
+    is_protected: NDArray[np.bool_]
+
+
+def frame_facts(buffer: Bytes, offsets: NDArray[np.int64], lengths: NDArray[np.int64]) -> FrameFacts:
+    """Sender and kind of each 0xC1 body at `offsets`, `lengths` bytes long (F,)."""
+    facts = FrameFacts(
+        np.full(len(offsets), UNKNOWN_MAC, np.int64),
+        np.zeros(len(offsets), np.bool_),
+        np.zeros(len(offsets), np.bool_),
+    )
+    addressed = np.flatnonzero(lengths >= _TWO_ADDRESSES_BYTES)
+    if not len(addressed):
+        return facts
+    data = np.frombuffer(buffer, np.uint8)
+    windows = np.ndarray(
+        (len(data) - _TWO_ADDRESSES_BYTES + 1, _TWO_ADDRESSES_BYTES), np.uint8, data, strides=(1, 1)
+    )
+    frame = windows[offsets[addressed]]
+    kind, subtype = frame[:, 0] >> 2 & 3, frame[:, 0] >> 4
+    without_sender = (kind == 3) | (kind == 1) & ((subtype < 8) | (subtype == 12) | (subtype == 13))
+    facts.sender[addressed] = np.where(without_sender, UNKNOWN_MAC, frame[:, 10:16] @ _BYTE_WEIGHTS)
+    facts.is_data[addressed] = (kind == 2) & (subtype & 4 == 0)
+    facts.is_protected[addressed] = frame[:, 1] & 0x40 != 0
+    return facts
 
 
 def data_frame(transmitter: int, receiver: int, bssid: int, sequence: int, payload: bytes = b"") -> bytes:

@@ -11,9 +11,8 @@ import time
 from pathlib import Path
 
 from vad.csi.attribution import Attribution
-from vad.csi.logfile import LogReader
+from vad.csi.intake import Intake
 from vad.csi.packets import CsiBatch
-from vad.csi.stamping import Stamper
 from vad.health import Health
 from vad.streams import DropOldestQueue
 
@@ -36,16 +35,13 @@ class FollowLog:
         path: the FIFO or file; may appear later.
         attribution: who the packets are from; pairs frames and CSI by default.
 
-    `health.counters`: bytes, packets, opened, truncated_bytes, bad_<reason> records, unattributed_<reason>
-    packets (vad.csi.attribution), clock_restarts.
+    `health.counters`: bytes, opened, truncated_bytes, and those of vad.csi.intake.
     """
 
     def __init__(self, path: Path, *, attribution: Attribution | None = None) -> None:
         self.health = Health("csi.follow")
         self._path = path
-        self._attribution = attribution or Attribution()
-        self._reader = LogReader(self._attribution)
-        self._stamper = Stamper()
+        self._intake = Intake(self.health, attribution)
 
     async def run(self, out: DropOldestQueue[CsiBatch]) -> None:
         """Emit batches until cancelled; opens the log again after trouble."""
@@ -88,9 +84,8 @@ class FollowLog:
         counters = self.health.counters
         counters["opened"] += 1
         if counters["opened"] > 1:
-            counters["truncated_bytes"] += self._reader.stats.truncated_bytes
-            self._reader.restart()
-            self._attribution.mark_loss()
+            counters["truncated_bytes"] += self._intake.reader.stats.truncated_bytes
+            self._intake.restart()
 
     async def _read_fifo(self, fifo_fd: int, out: DropOldestQueue[CsiBatch]) -> None:
         loop = asyncio.get_running_loop()
@@ -129,20 +124,10 @@ class FollowLog:
             await asyncio.sleep(POLL_S)
 
     def _emit(self, data: bytes, out: DropOldestQueue[CsiBatch], woken_ns: int | None) -> None:
-        read_ns = time.monotonic_ns()
-        batch = self._reader.feed(data)
-        counters = self.health.counters
-        counters["bytes"] += len(data)
-        for reason, n in self._reader.stats.bad.items():
-            counters[f"bad_{reason}"] = n
-        for reason, n in self._attribution.unknown.items():
-            counters[f"unattributed_{reason}"] = n
-        if not batch.raw:
-            return
-        batch = self._stamper.stamp(batch, read_ns, woken_ns)
-        counters["packets"] += len(batch.packets)
-        counters["clock_restarts"] = self._stamper.clock.restarts
-        out.put(batch)
+        self.health.counters["bytes"] += len(data)
+        batch = self._intake.feed(data, time.monotonic_ns(), woken_ns)
+        if batch.raw:
+            out.put(batch)
 
 
 def _wake(woken: asyncio.Future[int]) -> None:

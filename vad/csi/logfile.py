@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vad.csi.attribution import Attribution
+from vad.csi.attribution import Attribution, count_steps
 from vad.csi.bfee import BFEE_CODE, Bytes, decode_bodies, empty_packets
 from vad.csi.packets import CsiBatch, CsiPackets
 
@@ -98,6 +98,16 @@ class LogReader:
         self._count = None
         self.stats.truncated_bytes = 0
 
+    def mark_loss(self) -> None:
+        """Records were lost here: the next packet's sender is unknown."""
+        if self._attribution is not None:
+            self._attribution.mark_loss()
+
+    @property
+    def unattributed(self) -> Counter[str]:
+        """Packets without a sender so far, by reason (vad.csi.attribution)."""
+        return Counter() if self._attribution is None else self._attribution.unknown
+
     def decode(self, buffer: Bytes, records: Records) -> tuple[CsiPackets, NDArray[np.int64]]:
         """Packets of the next records, which lie complete in `buffer`, and where each one's record starts."""
         stats, offsets = self.stats, records.offsets
@@ -109,9 +119,9 @@ class LogReader:
         codes = data[offsets + _LENGTH_BYTES]
         bodies = offsets + _HEAD_BYTES
         lengths = (data[offsets].astype(np.int64) << 8 | data[offsets + 1]) - 1
-        for code, n in enumerate(np.bincount(codes).tolist()):
-            if n:
-                stats.records[code] += n
+        tally = np.bincount(codes)
+        for code in tally.nonzero()[0].tolist():
+            stats.records[code] += int(tally[code])
         csi_records = np.flatnonzero(codes == BFEE_CODE)
         decoded = decode_bodies(buffer, bodies[csi_records], lengths[csi_records])
         packets, sound = decoded.packets, csi_records[decoded.index]
@@ -126,12 +136,13 @@ class LogReader:
     def _count_gaps(self, bfee_count: NDArray[np.uint16]) -> None:
         if not len(bfee_count):
             return
-        known = bfee_count if self._count is None else np.insert(bfee_count, 0, self._count)
-        missing = np.diff(known) - np.uint16(1)
-        self.stats.gaps += int(np.count_nonzero(missing))
-        # A count that goes backwards shows as a jump of more than half its range.
-        self.stats.lost += int(missing[missing < 0x8000].sum(dtype=np.int64))
+        step = count_steps(bfee_count, self._count)
         self._count = int(bfee_count[-1])
+        missing = step[step != 1] - np.uint16(1)
+        if len(missing):
+            self.stats.gaps += len(missing)
+            # A count that goes backwards shows as a jump of more than half its range.
+            self.stats.lost += int(missing[missing < 0x8000].sum(dtype=np.int64))
 
 
 def read_log(buffer: Bytes, attribution: Attribution | None = None) -> tuple[CsiPackets, LogStats]:

@@ -15,28 +15,63 @@ from vad.config import (
     ConnectorCsi,
     DeviceSettings,
     FolderCameraSettings,
+    LineRobot,
     MjpegCameraSettings,
     NeatoRobot,
     RadioSettings,
+    RoombaRobot,
+    Ros2Robot,
     Settings,
+    ValetudoRobot,
 )
+from vad.csi.attribution import Attribution
 from vad.csi.connector import Connector
 from vad.csi.follow import FollowLog
 from vad.csi.packets import CsiSource
 from vad.devices.hostapd_source import HostapdSource
 from vad.devices.static_list import StaticList
 from vad.devices.station import JoinSource
+from vad.mac import mac_from_text
+from vad.robot.json_line_source import JsonLineSource
 from vad.robot.neato_source import NeatoSource
 from vad.robot.pose import PoseSource
+from vad.robot.roomba_source import RoombaSource
+from vad.robot.ros2 import Frames
+from vad.robot.ros2_keys import Style
+from vad.robot.ros2_source import Ros2Source, Ros2Topics
+from vad.robot.valetudo_source import ValetudoSource
 from vad.robot.zenoh_source import ZenohPoseSource
 
 
 def robot_source(settings: Settings, session: zenoh.Session) -> PoseSource:
     """The robot; `session` is the open zenoh session."""
-    robot = settings.robot
+    robot, epoch = settings.robot, settings.map.epoch
     if isinstance(robot, NeatoRobot):
-        return NeatoSource(robot.port, rate_hz=robot.rate_hz, epoch=settings.map.epoch)
-    return ZenohPoseSource(session, robot.key, epoch=settings.map.epoch)
+        return NeatoSource(robot.port, rate_hz=robot.rate_hz, epoch=epoch)
+    if isinstance(robot, Ros2Robot):
+        return Ros2Source(robot.endpoint or session, _topics(robot), epoch=epoch)
+    if isinstance(robot, ValetudoRobot):
+        if robot.url is not None:
+            return ValetudoSource(robot.url, epoch=epoch)
+        return ValetudoSource(session, robot.key or "", epoch=epoch)
+    if isinstance(robot, RoombaRobot):
+        return RoombaSource(robot.port, baud=robot.baud, epoch=epoch)
+    if isinstance(robot, LineRobot):
+        return JsonLineSource(robot.port, baud=robot.baud, epoch=epoch)
+    return ZenohPoseSource(session, robot.key, epoch=epoch)
+
+
+def _topics(robot: Ros2Robot) -> Ros2Topics:
+    styles: tuple[Style, ...] = ("rmw_zenoh", "bridge") if robot.style == "both" else (robot.style,)
+    return Ros2Topics(
+        namespace=robot.namespace,
+        domain=robot.domain,
+        styles=styles,
+        pose_kind=robot.pose,
+        pose_topic=robot.pose_topic,
+        map_topic=robot.map_topic,
+        frames=Frames(robot.map_frame, robot.base_frames),
+    )
 
 
 def camera_source(settings: CameraSettings, base: Path) -> CameraSource:
@@ -54,9 +89,10 @@ def camera_source(settings: CameraSettings, base: Path) -> CameraSource:
 def csi_source(settings: RadioSettings, base: Path) -> CsiSource:
     """The CSI radio; relative paths are taken from `base`."""
     source = settings.source
+    attribution = Attribution(None if settings.transmitter is None else mac_from_text(settings.transmitter))
     if isinstance(source, ConnectorCsi):
-        return Connector(source.group, allow_user_space=source.allow_user_space)
-    return FollowLog(base / source.path)
+        return Connector(source.group, attribution=attribution, allow_user_space=source.allow_user_space)
+    return FollowLog(base / source.path, attribution=attribution)
 
 
 def join_sources(settings: DeviceSettings, base: Path) -> list[JoinSource]:

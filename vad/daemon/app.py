@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import signal
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +23,17 @@ from vad.daemon.adapters import camera_source, csi_source, join_sources, robot_s
 from vad.daemon.captures import Captures
 from vad.daemon.ears import Ears
 from vad.daemon.eyes import Eyes
+from vad.daemon.floor import Change, FloorKeeper, first_plan, follow_plans
 from vad.daemon.notify import notify
 from vad.daemon.registry import Registry
 from vad.devices.station import StationEvent
+from vad.errors import VadError
 from vad.health import Health
 from vad.mapping.camera_calibration import CameraCalibration
+from vad.mapping.reanchor import moved_calibration
 from vad.robot.floor_plan import FloorPlan
-from vad.robot.map_server import load_floor_plan
-from vad.robot.pose import RobotPose
+from vad.robot.map_server import load_floor_plan, load_rooms
+from vad.robot.pose import MapSource, PoseSource, RobotPose
 from vad.store.records import CameraRecord, EpochRecord
 from vad.store.worker import StoreWorker
 from vad.streams import DropOldestQueue
@@ -41,15 +44,13 @@ _log = logging.getLogger(__name__)
 STATUS_EVERY_S = 0.5
 
 
-class _StopRequestedError(Exception):
-    """SIGINT or SIGTERM came."""
-
-
 async def run_daemon(settings: Settings, config_file: Path) -> None:
-    """Run until SIGINT or SIGTERM; VadError where something without which nothing works is missing."""
-    plan = await asyncio.to_thread(
-        load_floor_plan, resolve(settings.map.file, config_file), epoch=settings.map.epoch
-    )
+    """Run until cancelled; VadError where something without which nothing works is missing or breaks."""
+    plan = None
+    if settings.map.file is not None:
+        plan = await asyncio.to_thread(
+            load_floor_plan, resolve(settings.map.file, config_file), epoch=settings.map.epoch
+        )
     model = resolve(settings.vision.model, config_file) if settings.vision.model else None
     network = await asyncio.to_thread(PoseNetwork, model, threads=settings.vision.threads)
     state_dir = resolve(settings.state_dir, config_file)
@@ -75,7 +76,7 @@ class Daemon:
         settings: Settings,
         config_file: Path,
         state_dir: Path,
-        plan: FloorPlan,
+        plan: FloorPlan | None,
         network: PoseNetwork,
         bus: Bus,
         store: StoreWorker,
@@ -83,7 +84,8 @@ class Daemon:
         self._settings = settings
         self._base = config_file.parent
         self._state_dir = state_dir
-        self._plan = plan
+        self._plan_of_file = plan
+        self._rooms_file = settings.map.rooms and resolve(settings.map.rooms, config_file)
         self._network = network
         self._bus = bus
         self._store = store
@@ -91,24 +93,28 @@ class Daemon:
         self._calibrations: DropOldestQueue[CameraCalibration] = DropOldestQueue(1)
 
     async def run(self) -> None:
-        """Run everything until a signal; re-raises what breaks a task."""
-        stop = asyncio.Event()
-        loop = asyncio.get_running_loop()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, stop.set)
+        """Run everything until cancelled; re-raises what breaks a task, a VadError as itself."""
         try:
             async with asyncio.TaskGroup() as group:
-                group.create_task(_raise_on(stop), name="signals")
                 await self._start(group)
                 notify("READY=1")
-        except* _StopRequestedError:
-            notify("STOPPING=1")
+        except ExceptionGroup as broken:
+            known, unknown = broken.split(VadError)
+            if unknown is not None or known is None:
+                raise
+            raise _first(known) from None
         finally:
-            for number in (signal.SIGINT, signal.SIGTERM):
-                loop.remove_signal_handler(number)
+            notify("STOPPING=1")
 
     async def _start(self, group: asyncio.TaskGroup) -> None:
         settings = self._settings
+        robot = robot_source(settings, self._bus.session)
+        poses: DropOldestQueue[RobotPose] = DropOldestQueue(256)
+        group.create_task(robot.run(poses), name="robot")
+        rooms = await asyncio.to_thread(load_rooms, self._rooms_file) if self._rooms_file else ()
+        keeper = FloorKeeper(self._state_dir / "plans", rooms)
+        self._plan, changed = await first_plan(keeper, self._plan_of_file, robot, self._say_waiting)
+        robot.epoch = self._plan.epoch
         known = await self._known_camera()
         eyes = Eyes(
             self._network,
@@ -124,15 +130,12 @@ class Daemon:
         self._publish_map()
         self._publish_camera(eyes.calibration)
 
-        robot = robot_source(settings, self._bus.session)
         camera = camera_source(settings.camera, self._base)
         csi = csi_source(settings.radio, self._base)
         joins = join_sources(settings.devices, self._base)
-        poses: DropOldestQueue[RobotPose] = DropOldestQueue(256)
         frames: DropOldestQueue[Frame] = DropOldestQueue(2)
         batches: DropOldestQueue[CsiBatch] = DropOldestQueue(256)
         stations: DropOldestQueue[StationEvent] = DropOldestQueue(1024)
-        group.create_task(robot.run(poses), name="robot")
         group.create_task(camera.run(frames), name="camera")
         group.create_task(csi.run(batches), name="csi")
         for source in joins:
@@ -143,16 +146,62 @@ class Daemon:
         group.create_task(_register(stations, registry), name="stations")
         group.create_task(captures.run(), name="captures")
         group.create_task(self._keep_calibrations(), name="calibrations")
-        parts = [robot.health, camera.health, eyes.health, csi.health, self._bus.health]
+        follow = partial(self._use_plan, robot, eyes, registry, captures)
+        if changed is not None:
+            await follow(changed)
+        if self._plan_of_file is None and isinstance(robot, MapSource):
+            group.create_task(follow_plans(keeper, robot.plans, follow), name="floor plan")
+        parts = [
+            robot.health,
+            camera.health,
+            eyes.health,
+            csi.health,
+            captures.traffic.health,
+            self._bus.health,
+        ]
         queues: dict[str, DropOldestQueue[Any]] = {"poses": poses, "frames": frames, "csi": batches}
         group.create_task(
             self._tell_status([*parts, *(s.health for s in joins)], queues, captures), name="status"
         )
 
+    async def _use_plan(
+        self, robot: PoseSource, eyes: Eyes, registry: Registry, captures: Captures, change: Change
+    ) -> None:
+        """Put another plan in force everywhere; what hangs on the old one is moved, or called stale."""
+        self._plan = change.plan
+        robot.epoch = change.plan.epoch
+        captures.use_plan(change.plan)
+        await registry.use_plan(change.plan, change.transform, change.reason)
+        if change.new_epoch:
+            await self._save_epoch()
+            if change.transform is None:
+                eyes.begin_anew(CameraCalibration("uncalibrated", 0, change.reason))
+            else:
+                eyes.begin_anew(moved_calibration(eyes.calibration, change.transform))
+        self._publish_map()
+
+    def _say_waiting(self, robot: PoseSource) -> None:
+        """The status while there is no floor plan yet: nothing else can begin."""
+        step = "waiting for the robot's map"
+        notify(f"READY=1\nSTATUS={step}")
+        self._bus.publish_status(
+            m.StatusMessage(
+                source=self._settings.source,
+                version=__version__,
+                uptime_s=round(time.monotonic() - self._started, 1),
+                step=step,
+                parts=(_part(robot.health), _part(self._bus.health)),
+            )
+        )
+
+    async def _save_epoch(self) -> None:
+        plan = self._plan
+        await self._store.save_epoch(EpochRecord(plan.epoch, str(plan.bounds_m), now_rfc3339()))
+
     async def _known_camera(self) -> CameraCalibration | None:
         """The calibration of an earlier run, if the map is still the same."""
         epoch = self._plan.epoch
-        await self._store.save_epoch(EpochRecord(epoch, str(self._plan.bounds_m), now_rfc3339()))
+        await self._save_epoch()
         for record in await self._store.cameras(epoch):
             if record.id == self._settings.camera.id:
                 known = CameraCalibration.from_dict(record.calibration)
@@ -234,9 +283,10 @@ class Daemon:
         )
 
 
-async def _raise_on(stop: asyncio.Event) -> None:
-    await stop.wait()
-    raise _StopRequestedError
+def _first(errors: ExceptionGroup[VadError]) -> VadError:
+    """The first error of a group of groups."""
+    error = errors.exceptions[0]
+    return _first(error) if isinstance(error, ExceptionGroup) else error
 
 
 async def _register(stations: DropOldestQueue[StationEvent], registry: Registry) -> None:

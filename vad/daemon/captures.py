@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import threading
 import time
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +30,8 @@ from vad.config import Settings
 from vad.daemon.ears import Ears
 from vad.daemon.eyes import Eyes
 from vad.daemon.registry import Registry
+from vad.daemon.threads import to_the_end
+from vad.daemon.traffic import Traffic
 from vad.errors import SessionError
 from vad.robot.floor_plan import FloorPlan
 from vad.solve import Solved, solve_session
@@ -40,6 +44,8 @@ TICK_S = 0.1
 MIN_PACKETS_PER_S = 60.0
 WALKER_GONE_NS = 1_500_000_000
 CAMERA_GIVES_UP_NS = 60_000_000_000
+UNWRITABLE_PAUSE_S = 5.0
+"""Before the next try where no session folder can be made."""
 
 
 @dataclass(slots=True)
@@ -73,6 +79,7 @@ class Captures:
         bus: Bus,
     ) -> None:
         self.step = "starting"
+        self.traffic = Traffic(settings)
         self._settings = settings
         self._plan = plan
         self._eyes = eyes
@@ -80,14 +87,22 @@ class Captures:
         self._registry = registry
         self._bus = bus
         self._sessions = state_dir / "sessions"
+        self._failed: dict[str, str] = {}  # why the last walk of a device could not be used
+
+    def use_plan(self, plan: FloorPlan) -> None:
+        """Go on with another floor plan; a walk that began on another epoch is not used."""
+        self._plan = plan
 
     async def run(self) -> None:
         """Measure devices until cancelled."""
-        while True:
-            await asyncio.sleep(TICK_S)
-            ready = await self._ready(time.monotonic_ns())
-            if ready is not None:
-                await self._capture(*ready)
+        try:
+            while True:
+                await asyncio.sleep(TICK_S)
+                ready = await self._ready(time.monotonic_ns())
+                if ready is not None:
+                    await self._capture(*ready)
+        finally:
+            await self.traffic.stop()
 
     async def _ready(self, now_ns: int) -> tuple[DeviceRecord, int] | None:
         """The device to measure now and the track of its walker; else says what is waited for."""
@@ -98,52 +113,90 @@ class Captures:
             for device in waiting:
                 await self._registry.wait(device.mac, "the camera does not know yet where it is")
             return None
+        walker = self._eyes.lone_mover(self._eyes.last_frame_ns)
         if not waiting:
+            await self.traffic.stop()
             self.step = "watching: no device waits to be measured"
             return None
+        await self._provoke(waiting, now_ns, somebody_walks=walker is not None)
         heard = [d for d in waiting if self._ears.heard_per_s(d.mac, now_ns) >= MIN_PACKETS_PER_S]
         for device in waiting:
-            if device not in heard:
-                rate = self._ears.heard_per_s(device.mac, now_ns)
+            if device not in heard and not self.traffic.reaches(device.mac):
                 # A reason that changed with every packet would be published with every packet.
-                said = "no CSI packet of it is heard" if rate == 0 else "too few CSI packets of it are heard"
-                await self._registry.wait(device.mac, said)
-        if not heard:
+                why = self._ears.why_unheard(device.mac, now_ns)
+                await self._registry.wait(device.mac, why or "too few CSI packets of it are heard")
+        within_reach = [d for d in waiting if d in heard or self.traffic.reaches(d.mac)]
+        if not within_reach:
             self.step = "waiting for CSI packets of a device"
             return None
         self.step = "waiting for somebody to walk through the picture"
-        for device in heard:
-            if device.walks == 0:
-                await self._registry.wait(device.mac, "waiting for somebody to walk through the picture")
-        walker = self._eyes.lone_mover(self._eyes.last_frame_ns)
-        return None if walker is None else (heard[0], walker)
+        for device in within_reach:
+            await self._registry.wait(device.mac, self._wish(device.mac))
+        return None if walker is None or not heard else (heard[0], walker)
+
+    def _wish(self, mac: str) -> str:
+        """What would tell more of the device, and why its last walk told nothing."""
+        wish = self._registry.wish(mac)
+        return f"{self._failed[mac]}; {wish}" if mac in self._failed else wish
+
+    async def _provoke(self, waiting: list[DeviceRecord], now_ns: int, *, somebody_walks: bool) -> None:
+        """While somebody walks, make the first device send that does not do so by itself."""
+        for device in waiting if somebody_walks else ():
+            if self.traffic.reaches(device.mac):
+                await self.traffic.towards(device.mac)
+                return
+            if self._ears.heard_per_s(device.mac, now_ns) >= MIN_PACKETS_PER_S:
+                break
+        await self.traffic.stop()
 
     async def _capture(self, device: DeviceRecord, track: int) -> None:
-        capture = await self._begin(device, track)
-        finished = False
+        try:
+            capture = await self._begin(device, track)
+        except OSError as error:
+            await self._give_up(device.mac, _unwritable(error))
+            await asyncio.sleep(UNWRITABLE_PAUSE_S)
+            return
+        unfinished = "the daemon stopped"
         try:
             await self._registry.capturing(device.mac)
             await self._record(capture)
-            finished = True
+            unfinished = ""
+        except OSError as error:
+            unfinished = _unwritable(error)
         finally:
             self._ears.stop_recording()
-            if not finished:
-                # Cancelled: the folder must not look like one that is still being recorded.
-                capture.wifi.abort("the daemon stopped")
-                capture.writer.abort("the daemon stopped")
+            if unfinished:
+                # The folder must not look like one that is still being recorded.
+                capture.wifi.abort(unfinished)
+                with contextlib.suppress(OSError):
+                    capture.writer.abort(unfinished)
+            await self.traffic.stop()
         if capture.wifi.state == "solving":
             await self._solve(capture)
         if capture.wifi.state == "aborted":
-            _log.info("capture %s aborted: %s", capture.session, capture.wifi.reason)
-            await self._registry.wait(device.mac, capture.wifi.reason)
+            await self._give_up(device.mac, capture.wifi.reason)
             self._publish(capture)
+
+    async def _give_up(self, mac: str, reason: str) -> None:
+        _log.info("capture of %s aborted: %s", mac, reason)
+        self._failed[mac] = reason
+        await self._registry.wait(mac, self._wish(mac))
 
     async def _begin(self, device: DeviceRecord, track: int) -> _Capture:
         now_ns = time.monotonic_ns()
         stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S.%f")[:-3]
         session = f"{stamp}-{device.mac.replace(':', '')}"
         header = self._header(session, device)
-        writer = await asyncio.to_thread(SessionWriter, self._sessions / session, header)
+        opening = asyncio.get_running_loop().run_in_executor(
+            None, SessionWriter, self._sessions / session, header
+        )
+        try:
+            writer = await asyncio.shield(opening)
+        except asyncio.CancelledError:
+            await asyncio.wait({opening})
+            if opening.exception() is None:
+                opening.result().abort("the daemon stopped")
+            raise
         camera = CameraSide(session, max_record_ns=CAMERA_GIVES_UP_NS)
         return _Capture(session, device.mac, track, WifiSide(session), camera, writer, now_ns, [])
 
@@ -158,7 +211,7 @@ class Captures:
             device=SessionDevice(device.mac, device.name),
             anchor=SessionAnchor(float(anchor[0]), float(anchor[1]), float(anchor[2])),
             radio=SessionRadio(
-                "intel5300", self._settings.radio.carrier_hz, self._settings.radio.bandwidth_mhz
+                "intel5300", self._settings.radio.carrier_hz, self._settings.radio.bandwidth_mhz, "anchor"
             ),
             map=SessionMap(self._plan.epoch, self._plan.bounds_m),
         )
@@ -183,7 +236,7 @@ class Captures:
         if capture.wifi.state == "solving":
             await self._write_walk(capture)
         else:
-            await asyncio.to_thread(capture.writer.abort, capture.wifi.reason)
+            await to_the_end(partial(capture.writer.abort, capture.wifi.reason))
 
     def _exchange(self, capture: _Capture) -> None:
         """One round of the handshake: deliver, let time pass, decide whether the record is long enough."""
@@ -217,9 +270,10 @@ class Captures:
         )
         if walk is None:
             capture.wifi.abort("the walker was seen in too few frames")
-            await asyncio.to_thread(capture.writer.abort, capture.wifi.reason)
+            await to_the_end(partial(capture.writer.abort, capture.wifi.reason))
             return
-        await asyncio.to_thread(capture.writer.close, walk.t_ns, walk.xy_m, _sigma_m(walk), capture.track)
+        close = partial(capture.writer.close, walk.t_ns, walk.xy_m, _sigma_m(walk), capture.track)
+        await to_the_end(close)
 
     async def _solve(self, capture: _Capture) -> None:
         self.step = f"working out where {capture.mac} is"
@@ -229,6 +283,9 @@ class Captures:
         except SessionError as error:
             capture.wifi.abort(str(error))
             return
+        if solved.session.header.map.epoch != self._plan.epoch:
+            capture.wifi.abort("the robot's map changed during the walk")
+            return
         if solved.evidence.posterior is None or solved.evidence.status == "refused":
             capture.wifi.abort(solved.evidence.reason)
             return
@@ -237,6 +294,7 @@ class Captures:
             capture.mac, solved.evidence.posterior, len(solved.session.t_ns), float(walk_s)
         )
         capture.wifi.solved()
+        self._failed.pop(capture.mac, None)
         result = m.CaptureResult(
             x_m=float(place.xy_m[0]), y_m=float(place.xy_m[1]), radius90_m=place.radius90_m
         )
@@ -262,6 +320,10 @@ class Captures:
                 result=result,
             )
         )
+
+
+def _unwritable(error: OSError) -> str:
+    return f"the session folder cannot be written ({error.strerror})"
 
 
 def _sigma_m(walk: SmoothTrack) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:

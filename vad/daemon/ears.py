@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-import asyncio
+import time
 from collections import deque
+from functools import partial
 
 import numpy as np
 
 from vad.capture.session_writer import SessionWriter
+from vad.csi.heard import HeardStations
 from vad.csi.packets import CsiBatch
+from vad.daemon.threads import to_the_end
 from vad.mac import UNKNOWN_MAC, mac_from_text
 from vad.streams import DropOldestQueue
 
@@ -25,6 +28,7 @@ class Ears:
     def __init__(self) -> None:
         self._heard: dict[int, deque[tuple[int, int]]] = {}
         self._recording: list[CsiBatch] | None = None
+        self._stations = HeardStations()
 
     async def run(self, batches: DropOldestQueue[CsiBatch]) -> None:
         """Listen until cancelled."""
@@ -35,6 +39,10 @@ class Ears:
         """Packets per second of this station over the last two seconds."""
         recent = self._heard.get(mac_from_text(mac), ())
         return sum(n for t, n in recent if now_ns - t <= _HEARD_OVER_NS) / (_HEARD_OVER_NS / 1e9)
+
+    def why_unheard(self, mac: str, now_ns: int) -> str:
+        """Why the station gives no CSI; empty where it does."""
+        return self._stations.reason(mac_from_text(mac), now_ns)
 
     def start_recording(self) -> None:
         """Keep every batch from now on."""
@@ -48,11 +56,12 @@ class Ears:
         """Write what was recorded since the last call."""
         if self._recording:
             waiting, self._recording = self._recording, []
-            await asyncio.to_thread(_write, writer, waiting)
+            await to_the_end(partial(_write, writer, waiting))
 
     def _take(self, batch: CsiBatch) -> None:
         if self._recording is not None:
             self._recording.append(batch)
+        self._stations.take(batch, time.monotonic_ns())
         packets = batch.packets
         if not len(packets):
             return

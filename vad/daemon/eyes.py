@@ -106,6 +106,13 @@ class Eyes:
         """When this person was last seen; 0 for an unknown track."""
         return next((int(t.t_ns[-1]) for t in self._tracker.tracks() if t.id == track_id), 0)
 
+    def begin_anew(self, calibration: CameraCalibration) -> None:
+        """The map changed: go on from this calibration, with nothing of what was seen on the old map."""
+        self._mapper = None
+        self._tracker = Tracker()
+        self._poses.clear()
+        self._take(calibration)
+
     async def follow_robot(self, poses: DropOldestQueue[RobotPose]) -> None:
         """Take robot poses until cancelled."""
         while True:
@@ -142,7 +149,9 @@ class Eyes:
         if self._new_evidence and frame.t_ns - self._solved_ns > SOLVE_EVERY_NS:
             self._solved_ns = frame.t_ns
             self._new_evidence = False
-            self._take_calibration(await asyncio.to_thread(mapper.solve))
+            found = await asyncio.to_thread(mapper.solve)
+            if mapper is self._mapper:  # else the map changed meanwhile
+                self._take_calibration(found)
         if self.calibration.status == "valid":
             self._track_people(frame.t_ns, seen.grounds)
         for listener in tuple(self._frame_listeners):
@@ -174,8 +183,11 @@ class Eyes:
         """A valid calibration is only replaced by a valid one: a new drive starts with few pairs."""
         if self.calibration.status == "valid" and found.status != "valid":
             return
-        self.calibration = found
-        self._on_calibration(found)
+        self._take(found)
+
+    def _take(self, calibration: CameraCalibration) -> None:
+        self.calibration = calibration
+        self._on_calibration(calibration)
 
     def _track_people(self, t_ns: int, grounds: list[GroundPoint]) -> None:
         if not grounds:

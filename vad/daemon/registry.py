@@ -10,9 +10,13 @@ import numpy as np
 from vad.bus import messages as m
 from vad.bus.node import Bus, now_rfc3339
 from vad.config import Settings
+from vad.daemon.floor import moved_estimate
 from vad.mac import normal_mac
-from vad.mapping.device_stage import PlaceEstimate, joint_posterior, place_from_posterior
+from vad.mapping.device_stage import PlaceEstimate, place_from_posterior
+from vad.mapping.evidence import joint_posterior
+from vad.mapping.plan_match import IDENTITY, PlanTransform
 from vad.mapping.posterior import Grid, Posterior
+from vad.mapping.reanchor import moved_posterior
 from vad.robot.floor_plan import FloorPlan
 from vad.store.records import DeviceRecord, Estimate, PosteriorRecord
 from vad.store.worker import StoreWorker
@@ -36,9 +40,8 @@ class Registry:
         """What earlier runs knew; coordinates of another map epoch are stale, a cut-off capture waits."""
         for record in await self._store.devices():
             known = record
-            if record.estimate and record.epoch != self._plan.epoch:
-                reason = f"measured on map epoch {record.epoch}, the map is now epoch {self._plan.epoch}"
-                known = replace(record, state="stale", reason=reason)
+            if stale := self._stale(record):
+                known = replace(record, state="stale", reason=stale)
             elif record.state == "capturing":
                 known = replace(record, state="waiting", reason="the daemon stopped during a capture")
             self._devices[record.mac] = known
@@ -76,12 +79,51 @@ class Registry:
         elif name and known.name != name:
             await self._keep(replace(known, name=name))
 
+    async def use_plan(self, plan: FloorPlan, transform: PlanTransform | None, reason: str) -> None:
+        """Go on with another floor plan.
+
+        What was measured on the plan before is moved with `transform`, old frame to new; without one it is
+        stale for `reason`.
+        """
+        before, self._plan = self._plan, plan
+        for record in self.all():
+            if record.epoch != before.epoch:
+                continue
+            if transform is None:
+                if record.estimate is not None:
+                    await self._keep(replace(record, state="stale", reason=reason))
+                continue
+            place = record.estimate and moved_estimate(record.estimate, transform, plan)
+            moved = replace(record, epoch=plan.epoch, estimate=place)
+            stored = await self._store.posterior(record.mac) if plan.epoch != before.epoch else None
+            if stored is None or stored.epoch != before.epoch:
+                if moved != record:
+                    await self._keep(moved)
+                continue
+            grid = Grid.over(plan.bounds_m, stored.step_m)
+            density = moved_posterior(_posterior(stored), transform, grid).log_density.astype(np.float32)
+            stored = replace(
+                stored, epoch=plan.epoch, bounds_m=_outer_edges(grid), log_posterior=density
+            )
+            await self._keep(moved, stored)
+            self._publish_heatmap(stored)
+
     async def wait(self, mac: str, reason: str) -> None:
         """Say what the device waits for; nothing happens when that was said already."""
         known = self._devices[mac]
-        state = "stale" if known.state == "stale" else "waiting"
+        if stale := self._stale(known):
+            state, reason = "stale", f"{stale}; {reason}"
+        else:
+            state = "waiting"
         if (known.state, known.reason) != (state, reason):
             await self._keep(replace(known, state=state, reason=reason))
+
+    def wish(self, mac: str) -> str:
+        """What would tell more of a device that is heard."""
+        known = self._devices[mac]
+        if known.estimate is None or self._stale(known):
+            return "waiting for somebody to walk through the picture"
+        return _another_walk(known.estimate.radius90_m, known.walks)
 
     async def capturing(self, mac: str) -> None:
         """A capture of this device has begun."""
@@ -131,20 +173,26 @@ class Registry:
         sharp = place.status == "located" and place.radius90_m <= capture.mapped_radius_m
         if sharp and walks >= capture.min_walks:
             return "mapped", ""
-        size = f"±{place.radius90_m:.1f} m after {walks} walk{'s' if walks > 1 else ''}"
         if walks >= capture.max_walks:
+            size = _size(place.radius90_m, walks)
             return "failed", f"{size}: more walks of this kind do not tell; walk elsewhere in the picture"
-        return "waiting", f"{size}; another walk through the picture makes it sharper"
+        return "waiting", _another_walk(place.radius90_m, walks)
+
+    def _stale(self, record: DeviceRecord) -> str:
+        """Why the coordinates of a record no longer hold; empty when they do."""
+        if record.estimate is None or record.epoch == self._plan.epoch:
+            return ""
+        return f"measured on map epoch {record.epoch}, the map is now epoch {self._plan.epoch}"
 
     async def _posterior_of(self, known: DeviceRecord, grid: Grid) -> Posterior | None:
-        """What earlier walks said, where it is of the same map and grid."""
+        """What earlier walks said, where it is of the same map epoch."""
         stored = await self._store.posterior(known.mac)
         if stored is None or stored.epoch != self._plan.epoch:
             return None
         before = _posterior(stored)
         same = (before.grid.rows, before.grid.columns) == (grid.rows, grid.columns)
         if not same or not np.allclose(before.grid.bounds_m, grid.bounds_m):
-            return None
+            return moved_posterior(before, IDENTITY, grid)  # the plan has grown since
         return Posterior(grid, before.log_density)
 
     def _estimate(self, place: PlaceEstimate) -> Estimate:
@@ -208,6 +256,14 @@ class Registry:
 
     def _event(self, kind: m.EventKind, mac: str, text: str) -> None:
         self._bus.publish_event(m.EventMessage(source=self._settings.source, kind=kind, mac=mac, text=text))
+
+
+def _size(radius90_m: float, walks: int) -> str:
+    return f"±{radius90_m:.1f} m after {walks} walk{'s' if walks > 1 else ''}"
+
+
+def _another_walk(radius90_m: float, walks: int) -> str:
+    return f"{_size(radius90_m, walks)}; another walk through the picture makes it sharper"
 
 
 def _posterior(stored: PosteriorRecord) -> Posterior:

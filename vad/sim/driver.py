@@ -1,4 +1,4 @@
-"""Plays a simulated radio as the 5300's kernel driver would: over the kernel connector or through a FIFO."""
+"""Plays a radio, simulated or recorded, as the 5300's kernel driver would: over the connector or a FIFO."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 from vad.csi.cn import IWLAGN_GROUP, IWLAGN_VALUE, NETLINK_CONNECTOR, build_message
 from vad.errors import SourceError
 from vad.health import Health
-from vad.sim.radio import RadioBatch
 
 log = logging.getLogger(__name__)
+
+Batch = TypeVar("Batch")
 
 BATCH_S = 0.02
 AHEAD_S = 0.04
@@ -39,14 +40,14 @@ _EMPTY_MESSAGE = struct.pack("=IHHII", 16, 3, 0, 0, 0)
 _UNUSED_GROUP = 32
 
 
-class PlayedRadio(Protocol):
-    """What `run` plays: vad.sim.radio.Radio."""
+class PlayedRadio(Protocol[Batch]):
+    """What `run` plays: vad.sim.radio.Radio, vad.sim.log_player.LogPlayer."""
 
-    def generate(self, t0_s: float, t1_s: float) -> RadioBatch:
+    def generate(self, t0_s: float, t1_s: float) -> Batch:
         """The packets with t0_s <= t < t1_s."""
         ...
 
-    def log_bytes(self, batch: RadioBatch) -> list[tuple[float, bytes]]:
+    def log_bytes(self, batch: Batch) -> list[tuple[float, bytes]]:
         """Their records with times, in order."""
         ...
 
@@ -229,15 +230,23 @@ class FifoSender:
         self._open = False
 
 
-async def run(radio: PlayedRadio, start_ns: int, sender: Sender) -> None:
-    """Play the radio in real time until cancelled; closes the sender.
+async def run(
+    radio: PlayedRadio[Batch],
+    start_ns: int,
+    sender: Sender,
+    *,
+    speed: float = 1.0,
+    until_s: float | None = None,
+) -> None:
+    """Play the radio until cancelled, or until all of it before `until_s` is sent; closes the sender.
 
     Args:
         radio: what is played; made in a thread of its own, in pieces of BATCH_S.
-        start_ns: the home's t = 0 on CLOCK_MONOTONIC.
+        start_ns: the radio's t = 0 on CLOCK_MONOTONIC.
         sender: gets each record within about TICK_S of its time. What is more than CATCH_UP_S late is not
             sent but counted in `sender.health.counters["late_records"]` (made but too late) and
-            `["skipped_ms"]` (not even made).
+            `["skipped_ms"]` (of the radio's time; not even made).
+        speed: how many seconds of the radio's time pass in one; all spans above are real time.
     """
     counters = sender.health.counters
 
@@ -247,20 +256,21 @@ async def run(radio: PlayedRadio, start_ns: int, sender: Sender) -> None:
     loop = asyncio.get_running_loop()
     maker = ThreadPoolExecutor(1, thread_name_prefix="sim-radio")
     waiting: deque[tuple[float, bytes]] = deque()
-    made_s = _now_s(start_ns)
+    made_s = _now_s(start_ns, speed)
     try:
-        while True:
-            now_s = _now_s(start_ns)
-            oldest_s = now_s - CATCH_UP_S
+        while until_s is None or made_s < until_s or waiting:
+            now_s = _now_s(start_ns, speed)
+            oldest_s = now_s - CATCH_UP_S * speed
             if made_s < oldest_s:
                 counters["skipped_ms"] += round(1000 * (oldest_s - made_s))
                 made_s = oldest_s
-            ahead = made_s >= now_s + AHEAD_S
+            ahead = made_s >= now_s + AHEAD_S * speed
             if not ahead:
-                until_s = made_s + BATCH_S
-                waiting.extend(await loop.run_in_executor(maker, make, made_s, until_s))
-                made_s = until_s
-            _send_due(waiting, _now_s(start_ns), sender)
+                next_s = made_s + BATCH_S * speed
+                waiting.extend(await loop.run_in_executor(maker, make, made_s, next_s))
+                made_s = next_s
+            now_s = _now_s(start_ns, speed)
+            _send_due(waiting, now_s, now_s - CATCH_UP_S * speed, sender)
             if ahead:
                 await asyncio.sleep(TICK_S)
     finally:
@@ -268,15 +278,15 @@ async def run(radio: PlayedRadio, start_ns: int, sender: Sender) -> None:
         sender.close()
 
 
-def _now_s(start_ns: int) -> float:
-    return (time.monotonic_ns() - start_ns) / 1e9
+def _now_s(start_ns: int, speed: float) -> float:
+    return (time.monotonic_ns() - start_ns) / 1e9 * speed
 
 
-def _send_due(waiting: deque[tuple[float, bytes]], now_s: float, sender: Sender) -> None:
+def _send_due(waiting: deque[tuple[float, bytes]], now_s: float, oldest_s: float, sender: Sender) -> None:
     due: list[bytes] = []
     while waiting and waiting[0][0] <= now_s:
         t_s, data = waiting.popleft()
-        if t_s < now_s - CATCH_UP_S:
+        if t_s < oldest_s:
             sender.health.counters["late_records"] += 1
         else:
             due.append(data)

@@ -1,0 +1,54 @@
+"""The commands put together: `vad COMMAND --help` teaches each."""
+
+from __future__ import annotations
+
+import typer
+
+from vad import __version__
+from vad.commands.csi import csi_app
+from vad.commands.demo import demo
+from vad.commands.devices import devices
+from vad.commands.map import map_
+from vad.commands.replay import replay
+from vad.commands.run import check_config, run
+from vad.commands.signals import release
+from vad.commands.sim import sim
+from vad.commands.status import status
+
+RELEASES_ITSELF = ("run", "sim")
+"""Commands that deliver the held signals when they are ready to end on them."""
+
+app = typer.Typer(
+    name="vad",
+    help="Puts every Wi-Fi device of a home on the robot vacuum's floor plan.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    epilog="Try it without any hardware:  vad demo",
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+@app.callback()
+def _vad(
+    context: typer.Context,
+    version: bool = typer.Option(False, "--version", callback=_version, is_eager=True),
+) -> None:
+    if context.invoked_subcommand not in RELEASES_ITSELF:
+        release()
+
+
+app.command()(run)
+app.command("check-config")(check_config)
+app.command()(devices)
+app.command("map")(map_)
+app.command()(status)
+app.command()(replay)
+app.command()(demo)
+app.command()(sim)
+app.add_typer(csi_app, name="csi")
