@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import threading
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 import pytest
 import pytest_asyncio
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as vad.cli does, before NumPy is imported
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

@@ -6,11 +6,14 @@ somebody's import.
 
 from __future__ import annotations
 
+import os
 import signal
 
 
 def main() -> None:
     """Run the command line; see vad.commands.app."""
+    # Small matrices: threads of the linear algebra only wait for each other, and a hub has few cores.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
     from vad.commands.app import app
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from vad.clock import unwrap_nic_us
@@ -21,7 +23,11 @@ from vad.mac import UNKNOWN_MAC, mac_from_text
 
 SCHEMA = "vad.session/1"
 
+MAX_SIDE_M = 300.0
+"""No home is larger: wider bounds are a slip that would only fill the memory."""
+
 FloatArray = NDArray[np.float64]
+Bounds = tuple[float, float, float, float]
 Source = Literal["live", "recorded", "simulated"]
 
 
@@ -41,18 +47,20 @@ class SessionAnchor(msgspec.Struct, frozen=True):
 
 
 class SessionRadio(msgspec.Struct, frozen=True):
-    """csi: the card; carrier and channel width."""
+    """csi: the card; carrier and channel width; array_end: whose receive antennas the CSI's rows are, the
+    unknown device's (the paper's layout, the anchor sends) or the anchor's (the hub hears the device)."""
 
     csi: str = "intel5300"
-    carrier_hz: float = 5.24e9
+    carrier_hz: Annotated[float, Meta(gt=0)] = 5.24e9
     bandwidth_mhz: int = 20
+    array_end: Literal["device", "anchor"] = "device"
 
 
 class SessionMap(msgspec.Struct, frozen=True):
     """epoch of the map; bounds_m [x0, y0, x1, y1] where the device may be."""
 
     epoch: int = 1
-    bounds_m: tuple[float, float, float, float] | None = None
+    bounds_m: Bounds | None = None
 
 
 class SessionClock(msgspec.Struct, frozen=True):
@@ -62,10 +70,10 @@ class SessionClock(msgspec.Struct, frozen=True):
 
 
 class SessionHeader(msgspec.Struct, frozen=True, kw_only=True):
-    """session.json. Fields that a newer version added are ignored."""
+    """session.json. Fields that a newer version added are ignored. id names files of reports, too."""
 
     schema: str
-    id: str
+    id: Annotated[str, Meta(pattern=r"^[^/\x00]{1,200}$")]
     source: Source
     device: SessionDevice
     anchor: SessionAnchor
@@ -74,13 +82,25 @@ class SessionHeader(msgspec.Struct, frozen=True, kw_only=True):
     clock: SessionClock = SessionClock()
 
 
+class _TruePlace(msgspec.Struct, frozen=True):
+    x_m: float
+    y_m: float
+
+
+class _Truth(msgspec.Struct, frozen=True):
+    """truth.json; what else it holds is ignored."""
+
+    device: _TruePlace
+
+
 @dataclass(frozen=True, slots=True)
 class Session:
     """A session folder in memory.
 
     t_ns int64 (N,) strictly increasing, session timeline; csi complex64 (N, 30, R, T): the device's packets
     of the most frequent antenna shape; walk_t_ns (M,), walk_xy_m (M, 2), walk_sigma_m (M,): the walker,
-    map frame; truth_m (2,) in test data only; notes: what was left out and why, one sentence each.
+    map frame; truth_m (2,) in test data only; notes: what was left out and why, one sentence each;
+    damage: those of them that tell of evidence which is lost.
     """
 
     header: SessionHeader
@@ -92,6 +112,7 @@ class Session:
     walk_sigma_m: FloatArray
     truth_m: FloatArray | None
     notes: list[str] = field(default_factory=list)
+    damage: list[str] = field(default_factory=list)
 
 
 def load_session(folder: Path) -> Session:
@@ -104,8 +125,6 @@ def load_session(folder: Path) -> Session:
         raise SessionError("the CSI log is empty", where=str(log_path))
     attribution = Attribution() if header.device.mac else None
     packets, stats = read_log(raw, attribution)
-    if stats.truncated_bytes:
-        notes.append(f"csi.dat ends in the middle of a record: {stats.truncated_bytes} bytes left out")
     if len(packets) == 0:
         raise SessionError("no CSI packet in the log", where=str(log_path))
     t_ns = _arrivals(folder, header, packets, notes)
@@ -113,8 +132,25 @@ def load_session(folder: Path) -> Session:
     shape = np.array([packets.n_rx[keep], packets.n_tx[keep]]).max(axis=1)
     csi = packets.csi[keep][:, :, : shape[0], : shape[1]]
     walk_t_ns, walk_xy_m, walk_sigma_m = _load_trajectory(folder / "trajectory.csv")
+    damage = []
+    if stats.truncated_bytes:
+        cut = f"csi.dat ends in the middle of a record: {stats.truncated_bytes} bytes left out"
+        missing_s = (int(walk_t_ns[-1]) - int(t_ns[keep[-1]])) / 1e9
+        if missing_s > 0:  # else only the tail, as when log_to_file was stopped
+            cut = f"{cut}; the last {missing_s:.1f} s of the walk are missing"
+            damage.append(cut)
+        notes.insert(0, cut)
     return Session(
-        header, folder, t_ns[keep], csi, walk_t_ns, walk_xy_m, walk_sigma_m, _load_truth(folder), notes
+        header,
+        folder,
+        t_ns[keep],
+        csi,
+        walk_t_ns,
+        walk_xy_m,
+        walk_sigma_m,
+        _load_truth(folder),
+        notes,
+        damage,
     )
 
 
@@ -133,9 +169,22 @@ def load_header(folder: Path) -> SessionHeader:
             f"unknown schema {named!r}", where=str(path), remedy=f"This version reads {SCHEMA!r}"
         )
     try:
-        return msgspec.json.decode(raw, type=SessionHeader)
+        header = msgspec.json.decode(raw, type=SessionHeader)
     except msgspec.MsgspecError as error:
         raise SessionError(str(error), where=str(path)) from error
+    if header.map.bounds_m is not None and (wrong := wrong_bounds(header.map.bounds_m)):
+        raise SessionError(f"map.bounds_m: {wrong}", where=str(path))
+    return header
+
+
+def wrong_bounds(bounds_m: Bounds) -> str:
+    """What is wrong with [x0, y0, x1, y1] as a home's bounds; empty when nothing is."""
+    x0, y0, x1, y1 = bounds_m
+    if not (x0 < x1 and y0 < y1):
+        return "x0 < x1 and y0 < y1 are needed"
+    if x1 - x0 > MAX_SIDE_M or y1 - y0 > MAX_SIDE_M:
+        return f"a side is longer than {MAX_SIDE_M:.0f} m"
+    return ""
 
 
 def _read(path: Path) -> bytes:
@@ -201,7 +250,10 @@ def _load_trajectory(path: Path) -> tuple[NDArray[np.int64], FloatArray, FloatAr
     for number, row in enumerate(csv.DictReader(io.StringIO(text)), start=2):
         try:
             point = (float(row["x_m"]), float(row["y_m"]), float(row.get("sigma_m") or 0.1))
-            rows.setdefault(row.get("track") or "", {})[int(row["t_ns"])] = point
+            t = int(row["t_ns"])
+            if not all(map(math.isfinite, point)) or not -(2**63) <= t < 2**63:
+                raise ValueError("out of range")
+            rows.setdefault(row.get("track") or "", {})[t] = point
         except (KeyError, TypeError, ValueError) as error:
             raise SessionError(f"line {number} is not t_ns,x_m,y_m,sigma_m,track", where=str(path)) from error
     if not rows:
@@ -217,7 +269,7 @@ def _load_truth(folder: Path) -> FloatArray | None:
     if not path.exists():
         return None
     try:
-        place = msgspec.json.decode(_read(path), type=dict[str, dict[str, float]])["device"]
-        return np.array([place["x_m"], place["y_m"]])
-    except (msgspec.MsgspecError, KeyError) as error:
+        truth = msgspec.json.decode(_read(path), type=_Truth)
+    except msgspec.MsgspecError as error:
         raise SessionError(f"no device place in it ({error})", where=str(path)) from error
+    return np.array([truth.device.x_m, truth.device.y_m])

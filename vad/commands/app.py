@@ -8,8 +8,10 @@ from vad import __version__
 from vad.commands.csi import csi_app
 from vad.commands.demo import demo
 from vad.commands.devices import devices
-from vad.commands.map import map_
+from vad.commands.doctor import doctor
+from vad.commands.map import map_app
 from vad.commands.replay import replay
+from vad.commands.robot import app as robot_app
 from vad.commands.run import check_config, run
 from vad.commands.signals import release
 from vad.commands.sim import sim
@@ -46,9 +48,11 @@ def _vad(
 app.command()(run)
 app.command("check-config")(check_config)
 app.command()(devices)
-app.command("map")(map_)
+app.add_typer(map_app, name="map")
 app.command()(status)
 app.command()(replay)
 app.command()(demo)
 app.command()(sim)
+app.command()(doctor)
 app.add_typer(csi_app, name="csi")
+app.add_typer(robot_app, name="robot")

@@ -26,12 +26,20 @@ from vad.commands.console import (
     reported_errors,
 )
 from vad.commands.devices import read_truth
+from vad.commands.map_files import export, import_, show
 from vad.errors import VadError
 from vad.report.floor import Floor, save_floor
 from vad.report.words import metres, printable
 
+map_app = typer.Typer(invoke_without_command=True, subcommand_metavar="[import|export|show ...]")
+map_app.command("import")(import_)
+map_app.command()(export)
+map_app.command()(show)
 
+
+@map_app.callback()
 def map_(
+    context: typer.Context,
     png: Annotated[Path | None, typer.Option(help="Write the map as PNG here.", metavar="FILE")] = None,
     svg: Annotated[Path | None, typer.Option(help="Write the map as SVG here.", metavar="FILE")] = None,
     truth: Annotated[
@@ -49,6 +57,8 @@ def map_(
 
     Exit code 0: done; 1: the daemon has no map yet; 2: a file cannot be used; 3: no daemon answers.
     """
+    if context.invoked_subcommand is not None:
+        return
     with reported_errors():
         for path, suffix in ((png, ".png"), (svg, ".svg")):
             if path is not None and path.suffix != suffix:

@@ -10,7 +10,8 @@ import typer
 from rich.progress import Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from vad.commands.console import EXIT_BAD_INPUT, EXIT_NOTHING, err, out, print_json
+from vad.capture.session import wrong_bounds
+from vad.commands.console import EXIT_BAD_INPUT, EXIT_NOTHING, complain, err, out, print_json
 from vad.errors import SessionError
 from vad.mapping.device_stage import PlaceEstimate
 from vad.mapping.posterior import Bounds
@@ -39,10 +40,12 @@ def replay(
 
     Example:  vad replay recordings/* --fuse --plot pictures/
 
-    Exit code 0: all sessions read; 2: some could not be read (one line each on standard error, the others
-    are still solved); 1: read, but no device could be placed.
+    Exit code 0: all sessions read; 2: some could not be read, or not to their end (one line each on standard
+    error; what can be solved still is); 1: read, but no device could be placed.
     """
     limits = _parse_bounds(bounds)
+    if plot is not None:
+        _make_folder(plot)
     solved: list[Solved] = []
     broken: list[dict[str, str]] = []
     with Progress(
@@ -50,20 +53,23 @@ def replay(
         TimeElapsedColumn(),
         console=err,
         transient=True,
+        disable=not err.is_terminal,
     ) as progress:
         task = progress.add_task("", total=len(sessions))
-        for folder in sessions:
-            progress.update(task, description=f"solving {folder.name} ({len(solved) + 1}/{len(sessions)})")
+        for number, folder in enumerate(sessions, start=1):
+            progress.update(task, description=f"solving {folder.name} ({number}/{len(sessions)})")
             try:
                 one = solve_session(folder, limits)
                 solved.append(one)
+                for sentence in one.session.damage:
+                    complain(f"{folder}: {sentence}")
                 if plot is not None:
                     from vad.report.session_plot import plot_session  # matplotlib takes a second to import
 
                     plot_session(one, plot)
             except SessionError as error:
                 broken.append({"folder": str(folder), "error": str(error)})
-                err.print(str(error), style="red", markup=False, highlight=False, soft_wrap=True)
+                complain(str(error))
     fused = fuse(solved) if fuse_walks else []
     if as_json:
         print_json(
@@ -76,7 +82,7 @@ def replay(
         )
     elif solved:
         _print_tables(solved, fused)
-    if broken:
+    if broken or any(s.session.damage for s in solved):
         raise typer.Exit(EXIT_BAD_INPUT)
     if not any(s.place for s in solved):
         raise typer.Exit(EXIT_NOTHING)
@@ -89,9 +95,16 @@ def _parse_bounds(text: str | None) -> Bounds | None:
         x0, y0, x1, y1 = (float(part) for part in text.split(","))
     except ValueError:
         raise typer.BadParameter(f"{text!r} is not X0,Y0,X1,Y1 in metres", param_hint="--bounds") from None
-    if not (np.isfinite([x0, y0, x1, y1]).all() and x0 < x1 and y0 < y1):
-        raise typer.BadParameter("X0 < X1 and Y0 < Y1 are needed", param_hint="--bounds")
+    if wrong := wrong_bounds((x0, y0, x1, y1)):
+        raise typer.BadParameter(wrong, param_hint="--bounds")
     return x0, y0, x1, y1
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise typer.BadParameter(f"{folder}: {error.strerror}", param_hint="--plot") from None
 
 
 def _place_record(place: PlaceEstimate) -> dict[str, Any]:
@@ -217,4 +230,5 @@ def _print_tables(solved: list[Solved], fused: list[Fused]) -> None:
             )
     for one in solved:
         for note in one.session.notes:
-            err.print(f"{one.session.header.id}: {note}", style="yellow", markup=False, highlight=False)
+            if note not in one.session.damage:  # said already
+                err.print(f"{one.session.header.id}: {note}", style="yellow", markup=False, highlight=False)

@@ -9,9 +9,9 @@ from typing import Annotated
 
 import typer
 
-from vad.commands.console import EXIT_BAD_INPUT, err, out
+from vad.commands.console import out, reported_errors
+from vad.commands.signals import until_ended
 from vad.config import load_settings
-from vad.errors import ConfigError, VadError
 
 ConfigOption = Annotated[
     Path, typer.Option("--config", "-c", help="The settings file.", envvar="VAD_CONFIG", show_default=True)
@@ -33,16 +33,11 @@ def run(
         level=logging.DEBUG if verbose else logging.INFO,
         format="%(asctime)s %(levelname)s %(name)s: %(message)s",
     )
-    try:
+    with reported_errors():
         settings = load_settings(config)
         from vad.daemon.app import run_daemon  # cv2, onnxruntime and zenoh take a second to import
 
-        asyncio.run(run_daemon(settings, config.resolve()))
-    except VadError as error:
-        err.print(str(error), style="red", markup=False, highlight=False, soft_wrap=True)
-        raise typer.Exit(EXIT_BAD_INPUT) from None
-    except KeyboardInterrupt:  # Ctrl-C before the daemon's own handlers were in place
-        raise typer.Exit(0) from None
+        asyncio.run(until_ended(run_daemon(settings, config.resolve())))
 
 
 def check_config(config: ConfigOption = DEFAULT_CONFIG) -> None:
@@ -52,12 +47,13 @@ def check_config(config: ConfigOption = DEFAULT_CONFIG) -> None:
 
     Exit code 0: usable; 2: not, and the line on standard error says which setting and why.
     """
-    try:
+    with reported_errors():
         settings = load_settings(config)
         from vad.daemon.checks import check_files
 
         check_files(settings, config.resolve())
-    except ConfigError as error:
-        err.print(str(error), style="red", markup=False, highlight=False, soft_wrap=True)
-        raise typer.Exit(EXIT_BAD_INPUT) from None
-    out.print(f"{config}: the settings are usable (hub {settings.hub!r}, source {settings.source})")
+    out.print(
+        f"{config}: the settings are usable (hub {settings.hub!r}, source {settings.source})",
+        markup=False,
+        soft_wrap=True,
+    )

@@ -47,7 +47,7 @@ def robot_source(settings: Settings, session: zenoh.Session) -> PoseSource:
     """The robot; `session` is the open zenoh session."""
     robot, epoch = settings.robot, settings.map.epoch
     if isinstance(robot, NeatoRobot):
-        return NeatoSource(robot.port, rate_hz=robot.rate_hz, epoch=epoch)
+        return NeatoSource(robot.port, rate_hz=robot.rate_hz, lidar=robot.lidar, epoch=epoch)
     if isinstance(robot, Ros2Robot):
         return Ros2Source(robot.endpoint or session, _topics(robot), epoch=epoch)
     if isinstance(robot, ValetudoRobot):

@@ -109,6 +109,9 @@ class Daemon:
     async def _start(self, group: asyncio.TaskGroup) -> None:
         settings = self._settings
         robot = robot_source(settings, self._bus.session)
+        camera = camera_source(settings.camera, self._base)
+        csi = csi_source(settings.radio, self._base)
+        joins = join_sources(settings.devices, self._base)
         poses: DropOldestQueue[RobotPose] = DropOldestQueue(256)
         group.create_task(robot.run(poses), name="robot")
         rooms = await asyncio.to_thread(load_rooms, self._rooms_file) if self._rooms_file else ()
@@ -130,9 +133,6 @@ class Daemon:
         self._publish_map()
         self._publish_camera(eyes.calibration)
 
-        camera = camera_source(settings.camera, self._base)
-        csi = csi_source(settings.radio, self._base)
-        joins = join_sources(settings.devices, self._base)
         frames: DropOldestQueue[Frame] = DropOldestQueue(2)
         batches: DropOldestQueue[CsiBatch] = DropOldestQueue(256)
         stations: DropOldestQueue[StationEvent] = DropOldestQueue(1024)

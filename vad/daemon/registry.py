@@ -102,9 +102,7 @@ class Registry:
                 continue
             grid = Grid.over(plan.bounds_m, stored.step_m)
             density = moved_posterior(_posterior(stored), transform, grid).log_density.astype(np.float32)
-            stored = replace(
-                stored, epoch=plan.epoch, bounds_m=_outer_edges(grid), log_posterior=density
-            )
+            stored = replace(stored, epoch=plan.epoch, bounds_m=_outer_edges(grid), log_posterior=density)
             await self._keep(moved, stored)
             self._publish_heatmap(stored)
 

@@ -77,14 +77,18 @@ class SimulatedHome:
     """One home in `folder`: writes vad.yaml, floor.yaml, floor.pgm, truth.json; then plays it in real time.
 
     bus_port: where the daemon's zenoh router shall listen. connector: real NETLINK_CONNECTOR (needs the
-    right to send to it) instead of a FIFO.
+    right to send to it) instead of a FIFO. start_at_s: the home's own time when `run` begins; what happened
+    before is past (a device that joined is listed).
     """
 
-    def __init__(self, scenario: Scenario, folder: Path, *, bus_port: int, connector: bool) -> None:
+    def __init__(
+        self, scenario: Scenario, folder: Path, *, bus_port: int, connector: bool, start_at_s: float = 0.0
+    ) -> None:
         self._scenario = scenario
         self._folder = folder
         self._bus_port = bus_port
         self._connector = connector
+        self._start_at_ns = int(start_at_s * 1e9)
         self._start_ns = 0
 
     async def run(self, ready: asyncio.Event | None = None) -> None:
@@ -92,7 +96,7 @@ class SimulatedHome:
         self._folder.mkdir(parents=True, exist_ok=True)
         renderer = await asyncio.to_thread(Renderer, self._scenario)
         radio = await asyncio.to_thread(Radio, self._scenario, seed=self._scenario.seed)
-        self._start_ns = time.monotonic_ns()
+        self._start_ns = time.monotonic_ns() - self._start_at_ns
         neato = VirtualNeato(self._robot_pose, link=self._folder / "neato.tty")
         hostapd = HostapdEmulator(self._folder / "hostapd.sock")
         sender = ConnectorSender() if self._connector else FifoSender(self._folder / "csi.fifo")
@@ -158,7 +162,7 @@ class SimulatedHome:
             "source": "simulated",
             "state_dir": "state",
             "map": {"file": "floor.yaml", "epoch": 1},
-            "robot": {"type": "neato", "port": str((self._folder / "neato.tty").resolve())},
+            "robot": {"type": "neato", "port": str(self._folder.resolve() / "neato.tty")},
             "camera": {"id": "main", "source": {"type": "mjpeg", "url": camera_url}},
             "radio": {
                 "source": csi,
@@ -168,7 +172,9 @@ class SimulatedHome:
             "devices": {"hostapd": ["hostapd.sock"]},
             "bus": {"listen": [f"tcp/127.0.0.1:{self._bus_port}"]},
         }
-        (self._folder / "vad.yaml").write_text(yaml.safe_dump(settings, sort_keys=False))
+        draft = self._folder / "vad.yaml.new"
+        draft.write_text(yaml.safe_dump(settings, sort_keys=False))
+        draft.replace(self._folder / "vad.yaml")  # who waits for it finds it whole, and all else in place
 
 
 def _jpeg(renderer: Renderer, t_s: float) -> bytes:

@@ -12,7 +12,7 @@ import os
 import pty
 import time
 import tty
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 Pose = tuple[float, float, float]
@@ -29,12 +29,20 @@ class VirtualNeato:
         pose_at: where the robot is at a time of the timeline; None while it is not localised.
         link: a stable name for the port: a symbolic link to the pty, replaced if it is there.
         latency_s: from command to reply; the pose is the one of the middle.
+        scan_at: what the laser sees at a time: 360 distances in mm, counter-clockwise from the front, 0
+            without an echo; None while it does not turn.
     """
 
     def __init__(
-        self, pose_at: Callable[[int], Pose | None], *, link: Path | None = None, latency_s: float = 0.004
+        self,
+        pose_at: Callable[[int], Pose | None],
+        *,
+        link: Path | None = None,
+        latency_s: float = 0.004,
+        scan_at: Callable[[int], Sequence[int] | None] = lambda _t_ns: None,
     ) -> None:
         self._pose_at = pose_at
+        self._scan_at = scan_at
         self._latency_s = latency_s
         self._link = link
         self._master, self._slave = pty.openpty()
@@ -83,6 +91,8 @@ class VirtualNeato:
         # "getr" is the shortest abbreviation that only GetRobotPos can mean here.
         if known and len(words[0]) >= len("getr"):
             body = _pose_line(self._pose_at(t_ns), t_ns)
+        elif len(words) == 1 and "getldsscan".startswith(words[0]) and len(words[0]) >= len("getld"):
+            body = _scan_lines(self._scan_at(t_ns))
         else:
             body = f"Unknown Cmd: '{command}'"
         return f"{command}\r\n{body}\r\n".encode("ascii", "replace") + _END_OF_REPLY
@@ -107,6 +117,14 @@ class VirtualNeato:
         with contextlib.suppress(BlockingIOError):
             os.write(self._master, reply)
         self.answered += 1
+
+
+def _scan_lines(scan: Sequence[int] | None) -> str:
+    """The laser's table; without a turning laser every line is an error."""
+    distances = [0] * 360 if scan is None else scan
+    lines = ["AngleInDegrees,DistInMM,Intensity,ErrorCodeHEX"]
+    lines += [f"{k},{mm},{1000 if mm else 0},{'0' if mm else '8035'}" for k, mm in enumerate(distances)]
+    return "\r\n".join([*lines, f"ROTATION_SPEED,{'0.00' if scan is None else '5.00'}"])
 
 
 def _pose_line(pose: Pose | None, t_ns: int) -> str:

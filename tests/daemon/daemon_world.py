@@ -1,0 +1,175 @@
+"""What the tests of the daemon share: `vad` as real processes, a camera that knows its place, waiting."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Self, TypeVar
+
+import numpy as np
+import yaml
+
+from vad.client import VadClient
+from vad.config import Settings, parse_settings
+from vad.errors import VadError
+from vad.geometry import floor_homography
+from vad.mapping.camera_calibration import PARAMETERS, CameraCalibration
+from vad.sim.render_shapes import View
+from vad.sim.scenario import Scenario
+from vad.store.records import CameraRecord
+from vad.store.store import Store
+
+T = TypeVar("T")
+
+STOP_S = 2.0
+"""How long the daemon may take to end."""
+LONG_AGO = "2026-01-01T00:00:00.000Z"
+
+
+def free_port() -> int:
+    """A TCP port of the loopback interface where nobody listens."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def wait_for(ask: Callable[[], T | None], what: str, timeout_s: float = 30.0) -> T:
+    """The first answer that is something; `what` is told of where none comes in time."""
+    until = time.monotonic() + timeout_s
+    while time.monotonic() < until:
+        if answer := ask():
+            return answer
+        time.sleep(0.02)
+    raise AssertionError(f"not in {timeout_s:.0f} s: {what}")
+
+
+async def until(condition: Callable[[], bool], what: str, timeout_s: float = 10.0) -> None:
+    """The same on the event loop."""
+    try:
+        async with asyncio.timeout(timeout_s):
+            while not condition():  # noqa: ASYNC110 - what is waited for has no event
+                await asyncio.sleep(0.02)
+    except TimeoutError:
+        raise AssertionError(f"not in {timeout_s:.0f} s: {what}") from None
+
+
+def true_calibration(scenario: Scenario) -> CameraCalibration:
+    """What a perfect drive would tell of the scenario's camera, with centimetres of doubt."""
+    view = View.of(scenario.camera)
+    doubt = np.array([2e-3, 2e-3, 2e-3, 0.02, 0.02, 0.02, 5e-3, 1e-3])
+    assert len(doubt) == PARAMETERS
+    return CameraCalibration(
+        "valid",
+        100,
+        "",
+        pairs=60,
+        camera_from_map=view.camera_from_map,
+        intrinsics=view.intrinsics,
+        map_from_image=floor_homography(view.intrinsics, view.camera_from_map),
+        deviation_m=0.02,
+        time_offset_s=0.0,
+        time_offset_sigma_s=0.01,
+        parameter_covariance=np.diag(doubt**2),
+    )
+
+
+def store_calibration(state_dir: Path, scenario: Scenario) -> None:
+    """Leave the camera's place in the store, as an earlier run would."""
+    with Store(state_dir / "vad.sqlite") as store:
+        store.save_camera(CameraRecord("main", 1, true_calibration(scenario).to_dict(), LONG_AGO))
+
+
+def change_settings(file: Path, **sections: Any) -> None:
+    """Replace top-level sections of a settings file."""
+    settings = yaml.safe_load(file.read_text())
+    file.write_text(yaml.safe_dump(settings | sections))
+
+
+def settings_for(folder: Path, **sections: Any) -> Settings:
+    """Settings with everything in `folder`, sections replaced as given."""
+    plain = {
+        "source": "simulated",
+        "state_dir": str(folder),
+        "map": {"file": "floor.yaml"},
+        "robot": {"type": "neato", "port": "neato.tty"},
+        "camera": {"source": {"type": "mjpeg", "url": "http://127.0.0.1:9/stream"}},
+        "radio": {"source": {"type": "follow", "path": "csi.fifo"}},
+        "devices": {"hostapd": ["hostapd.sock"]},
+        "capture": {"mapped_radius_m": 0.8, "min_walks": 2, "max_walks": 8},
+    }
+    return parse_settings(yaml.safe_dump(plain | sections), where="vad.yaml")
+
+
+class Vad:
+    """`vad ARGUMENTS` as a process of its own; what it says goes into `log`. Killed where a test fails."""
+
+    def __init__(self, *arguments: str | Path, log: Path) -> None:
+        self.log = log
+        command = [sys.executable, "-m", "vad", *map(str, arguments)]
+        with log.open("wb") as file:
+            self._process = subprocess.Popen(command, stdout=file, stderr=file, cwd=Path(__file__).parents[2])
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._process.poll() is None:
+            self._process.kill()
+        self._process.wait()
+
+    @property
+    def said(self) -> str:
+        """Everything it has printed."""
+        return self.log.read_text()
+
+    @property
+    def running(self) -> bool:
+        """True until it has ended."""
+        return self._process.poll() is None
+
+    @property
+    def holds_signals(self) -> bool:
+        """True from the program's first line until it is ready to end on a signal."""
+        status = Path(f"/proc/{self._process.pid}/status").read_text()
+        (blocked,) = (int(line.split()[1], 16) for line in status.splitlines() if line.startswith("SigBlk:"))
+        return bool(blocked & 1 << (signal.SIGTERM - 1))
+
+    def send(self, number: signal.Signals) -> None:
+        """Send a signal."""
+        self._process.send_signal(number)
+
+    def end(self, number: signal.Signals, timeout_s: float = STOP_S) -> float:
+        """Send the signal; it ends within `timeout_s`, exit code 0, no traceback. The seconds it took."""
+        assert self._process.poll() is None, self.said
+        begun = time.monotonic()
+        self._process.send_signal(number)
+        try:
+            code = self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            raise AssertionError(f"runs on {timeout_s} s after {number.name}:\n{self.said}") from None
+        assert code == 0, self.said
+        assert "Traceback" not in self.said, self.said
+        assert "Error" not in self.said, self.said
+        return time.monotonic() - begun
+
+
+def connect(vad: Vad, port: int, timeout_s: float = 30.0) -> VadClient:
+    """A client of the daemon `vad` that comes up at `port`; to be closed."""
+
+    def attempt() -> VadClient | None:
+        assert vad.running, vad.said
+        client = VadClient(f"tcp/127.0.0.1:{port}")
+        try:
+            client.open()
+        except VadError:
+            client.close()
+            return None
+        return client
+
+    return wait_for(attempt, f"a daemon at port {port}", timeout_s)
