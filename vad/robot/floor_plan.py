@@ -41,7 +41,8 @@ class FloorPlan:
 
     epoch: changes when the robot's map does; resolution_m: side of a cell; origin: x_m, y_m, yaw_rad in the
     map frame of the outer corner of cell (0, 0); cells: (rows, cols) int8, row 0 at the bottom, -1 unknown,
-    0 free, 100 occupied, between them the occupancy in percent; rooms: the first that contains a point wins.
+    0 free, 100 occupied, between them the occupancy in percent; rooms: the first that contains a point wins;
+    map_id: the robot's own name of this map, empty where it gives none.
     """
 
     epoch: int
@@ -49,6 +50,7 @@ class FloorPlan:
     origin: tuple[float, float, float]
     cells: NDArray[np.int8]
     rooms: tuple[Room, ...] = field(default=())
+    map_id: str = ""
 
     def __post_init__(self) -> None:
         if self.cells.ndim != 2 or self.cells.dtype != np.int8 or self.cells.size == 0:

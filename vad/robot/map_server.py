@@ -147,6 +147,19 @@ def load_floor_plan(path: Path, *, epoch: int) -> FloorPlan:
     return floor_plan_from_bytes(yaml_bytes, pgm, epoch=epoch, where=str(path), image_where=str(image))
 
 
+def load_rooms(path: Path) -> tuple[Room, ...]:
+    """The rooms of a YAML that has the key `rooms` as described above. SourceError, ConfigError."""
+    data = _read(path, "Give the path of a YAML with rooms")
+    try:
+        tree = yaml.safe_load(data)
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError("this is not YAML", where=str(path), remedy="Correct the file") from error
+    rooms = _Reader(tree if isinstance(tree, dict) else {}, str(path)).rooms()
+    if not rooms:
+        raise ConfigError("no rooms here", where=str(path), remedy=_REMEDIES["rooms"])
+    return rooms
+
+
 def save_floor_plan(plan: FloorPlan, path: Path) -> None:
     """Write `path` (.yaml) and the picture beside it (.pgm); SourceError where that cannot be done."""
     image = path.with_suffix(".pgm")

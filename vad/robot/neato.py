@@ -10,13 +10,20 @@ import math
 import re
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 POSE_COMMAND = b"GetRobotPos Smooth\n"
+SCAN_COMMAND = b"GetLDSScan\n"
 END_OF_REPLY = 0x1A
 MAX_REPLY_BYTES = 32_768
 """Three times the longest known reply (GetLDSScan, 360 lines)."""
 
 MAX_COORDINATE_M = 500.0
 REPLY_TIMEOUT_NS = 1_000_000_000
+SCAN_TIMEOUT_NS = 2_500_000_000
+"""Three times the 0.8 s that a scan takes over the line."""
+BEAMS = 360
 DRAIN_NS = 500_000_000
 """How long nothing is asked after a missing reply, so that a late one is not taken for the next one."""
 COMMAND_GAP_NS = 50_000_000
@@ -51,6 +58,15 @@ class NeatoReading:
     t_ns: int
     round_trip_ns: int
     position: NeatoPosition
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NeatoScan:
+    """One turn of the laser. t_ns: when it was asked for; ranges_m: (360,), counter-clockwise from the
+    front, NaN without an echo."""
+
+    t_ns: int
+    ranges_m: NDArray[np.float64]
 
 
 class ReplyParser:
@@ -123,25 +139,60 @@ def _position_from_fields(fields: str) -> NeatoPosition | None:
     return NeatoPosition(x_m, y_m, math.pi if yaw_rad == -math.pi else yaw_rad, time_s, localised)
 
 
+def ranges_from_reply(reply: NeatoReply) -> NDArray[np.float64] | None:
+    """The ranges in a reply to `GetLDSScan`, (360,) metres; None where they are not all there.
+
+    Columns are found by their labels. Readings with an error code, or of 0 mm, are NaN.
+    """
+    head = next(
+        (k for k, line in enumerate(reply.lines) if "angle" in line.lower() and "dist" in line.lower()), None
+    )
+    if head is None:
+        return None
+    labels = [label.strip().lower() for label in reply.lines[head].split(",")]
+    columns = [
+        next((k for k, label in enumerate(labels) if label.startswith(name)), -1)
+        for name in ("angle", "dist", "err")
+    ]
+    if -1 in columns:
+        return None
+    ranges, seen = np.full(BEAMS, np.nan), np.zeros(BEAMS, np.bool_)
+    for line in reply.lines[head + 1 :]:
+        words = line.split(",")
+        values = [words[k].strip() for k in columns if k < len(words)]
+        if len(values) < 3 or not (values[0].isdecimal() and values[1].isdecimal()):
+            continue
+        angle, mm = int(values[0][:9]), int(values[1][:9])
+        if angle < BEAMS:
+            seen[angle] = True
+            if mm > 0 and values[2] == "0":
+                ranges[angle] = mm / 1000
+    return ranges if seen.all() else None
+
+
 class NeatoPoller:
     """Asks for the position `rate_hz` times a second and pairs replies with requests; one per connection.
 
     Implements `serial_port.SerialDialogue`. `bad` counts replies that were missing, late or not understood.
+    scan_every_ns: how often a laser scan is asked for, too; the line is busy with it for 0.8 s.
     """
 
-    def __init__(self, rate_hz: float) -> None:
+    def __init__(self, rate_hz: float, scan_every_ns: int | None = None) -> None:
         if not (math.isfinite(rate_hz) and rate_hz > 0):
             raise ValueError("rate_hz must be positive")
         self._period_ns = round(1e9 / rate_hz)
         self._parser = ReplyParser()
         self._asked_ns: int | None = None
         self._next_ns: int | None = None
+        self._scan_every_ns = scan_every_ns
+        self._next_scan_ns: int | None = None
+        self._scanning = False
         self.bad = 0
 
     def to_send(self, now_ns: int) -> bytes:
         """The next command when it is due, else nothing."""
         if self._asked_ns is not None:
-            if now_ns - self._asked_ns >= REPLY_TIMEOUT_NS:
+            if now_ns - self._asked_ns >= (SCAN_TIMEOUT_NS if self._scanning else REPLY_TIMEOUT_NS):
                 self._asked_ns = None
                 self._next_ns = now_ns + DRAIN_NS
                 self.bad += 1
@@ -153,13 +204,32 @@ class NeatoPoller:
         self._next_ns = max(due_ns + self._period_ns, now_ns)
         self._asked_ns = now_ns
         self._parser.reset()
-        return POSE_COMMAND
+        self._scanning = self._scan_is_due(now_ns)
+        return SCAN_COMMAND if self._scanning else POSE_COMMAND
 
-    def receive(self, data: bytes, now_ns: int) -> list[NeatoReading]:
+    def _scan_is_due(self, now_ns: int) -> bool:
+        if self._scan_every_ns is None:
+            return False
+        if self._next_scan_ns is None:
+            self._next_scan_ns = now_ns + self._scan_every_ns  # a position comes first
+        if now_ns < self._next_scan_ns:
+            return False
+        self._next_scan_ns = now_ns + self._scan_every_ns
+        return True
+
+    def receive(self, data: bytes, now_ns: int) -> list[NeatoReading | NeatoScan]:
         """The readings that `data`, arrived at `now_ns`, completes."""
-        readings = []
+        readings: list[NeatoReading | NeatoScan] = []
         for reply in self._parser.feed(data):
             asked_ns, self._asked_ns = self._asked_ns, None
+            if self._scanning and asked_ns is not None:
+                ranges = ranges_from_reply(reply)
+                if ranges is None:
+                    self.bad += 1
+                else:
+                    readings.append(NeatoScan(asked_ns, ranges))
+                self._next_ns = now_ns + COMMAND_GAP_NS
+                continue
             position = position_from_reply(reply)
             if asked_ns is None or position is None:
                 self.bad += 1

@@ -11,8 +11,8 @@ import zenoh
 
 from vad.errors import ProtocolError
 from vad.health import Health
-from vad.robot.json_source import pose_from_json
-from vad.robot.pose import RobotPose
+from vad.robot.json_source import NO_PLACE_REASONS, report_from_json
+from vad.robot.pose import RobotPose, RobotStatus, status_now
 from vad.streams import DropOldestQueue
 
 SILENCE_S = 2.0
@@ -35,7 +35,13 @@ class ZenohPoseSource:
         self.health = Health(f"robot {key_expr}")
         self._session = session
         self._key_expr = key_expr
-        self._epoch = epoch
+        self._status: RobotStatus = "unknown"
+        self.epoch = epoch
+
+    @property
+    def status(self) -> RobotStatus:
+        """Whether the robot knows where it is."""
+        return status_now(self._status, self.health)
 
     async def run(self, out: DropOldestQueue[RobotPose]) -> None:
         """Emit poses into `out` until cancelled; trouble goes into `health`, never out of here."""
@@ -80,15 +86,20 @@ class ZenohPoseSource:
                 silence, deadline_s = nothing, loop.time() + SILENCE_S
                 continue
             try:
-                pose = pose_from_json(payload, now_ns, self._epoch)
+                report = report_from_json(payload, now_ns, self.epoch)
             except ProtocolError as error:
                 silence = f"no usable pose for {SILENCE_S:g} s. {error}"
                 self._bad_input(error)
                 continue
             silence, deadline_s = nothing, loop.time() + SILENCE_S
+            if not isinstance(report, RobotPose):
+                self._status = report
+                self._trouble(NO_PLACE_REASONS[report])
+                continue
+            self._status = report.status
             self.health.counters["poses"] += 1
             self.health.ok()
-            out.put(pose)
+            out.put(report)
 
     def _bad_input(self, error: ProtocolError) -> None:
         level = logging.DEBUG if self.health.counters["bad_input"] else logging.WARNING
