@@ -1,9 +1,13 @@
-"""The radio of a simulated home: the packets of its device as the hub's Intel 5300 hears them."""
+"""The radio of a simulated home: the packets between its device and its hub as an Intel 5300 hears them.
+
+The card is the hub's, which hears the device; or the device's, which hears the hub: the paper's layout.
+"""
 
 from __future__ import annotations
 
 import zlib
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +16,7 @@ from vad.csi.bfee import BFEE_CODE, encode_bodies
 from vad.csi.dot11 import FRAME_CODE, data_frame
 from vad.csi.logfile import record
 from vad.mac import mac_from_text
-from vad.sim.radio_channel import WAVELENGTH_M, Channel
+from vad.sim.radio_channel import FURNISHED, WAVELENGTH_M, Channel, Surroundings
 from vad.sim.radio_nic import NOISE_DBM, Nic
 from vad.sim.scenario import Scenario
 
@@ -41,7 +45,7 @@ class RadioBatch:
     csi          int8 (N, 30, R, 1, 2), rows by antenna (A, B, C), real then imaginary
     rssi         uint8 (N, 3); noise_dbm int8 (N,); agc, antenna_sel uint8 (N,); rate uint16 (N,)
     bfee_count   uint16 (N,); nic_us uint32 (N,); both wrap
-    mac          int64 (N,) the transmitter: the device or OTHER_MAC
+    mac          int64 (N,) the transmitter: the device (the hub where the device listens) or OTHER_MAC
     legacy_t_s   float64 (M,); legacy_frames: M frames without CSI
     """
 
@@ -62,6 +66,8 @@ class RadioBatch:
         return len(self.t_s)
 
 
+ArrayEnd = Literal["hub", "device"]
+
 _PACKET_FIELDS = (
     "t_s",
     "csi",
@@ -81,14 +87,25 @@ class Radio:
 
     Args:
         scenario: the home; the device sends from `join_s` on.
-        packets_per_s: the device's rate, before 1-3 % are lost.
-        n_rx: antennas of the hub, 1..3, half a wavelength apart on a line of random direction.
+        packets_per_s: the link's rate, before 1-3 % are lost.
+        n_rx: antennas of the card, 1..3, half a wavelength apart on a line of random direction.
         seed: of everything the scenario does not fix.
+        array_end: where the card and its antennas are; the other end sends.
+        surroundings: what walls and furniture are drawn from.
 
     Not for use by two threads at once.
     """
 
-    def __init__(self, scenario: Scenario, *, packets_per_s: float = 400.0, n_rx: int = 3, seed: int) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        *,
+        packets_per_s: float = 400.0,
+        n_rx: int = 3,
+        seed: int,
+        array_end: ArrayEnd = "hub",
+        surroundings: Surroundings = FURNISHED,
+    ) -> None:
         if not 1 <= n_rx <= 3:
             raise ValueError("an Intel 5300 has 1 to 3 antennas")
         if packets_per_s <= 0:
@@ -98,15 +115,18 @@ class Radio:
         azimuth, tilt = rng.uniform(0, 2 * np.pi), rng.uniform(-0.35, 0.35)
         line = np.array([np.cos(azimuth) * np.cos(tilt), np.sin(azimuth) * np.cos(tilt), np.sin(tilt)])
         places = (np.arange(n_rx) - (n_rx - 1) / 2) * WAVELENGTH_M / 2
-        self.antennas_m: FloatArray = np.array(scenario.anchor_m) + places[:, None] * line
+        hub_m, device_m = np.array(scenario.anchor_m), np.array(scenario.device_m)
+        array_m, sender_m = (hub_m, device_m) if array_end == "hub" else (device_m, hub_m)
+        self.antennas_m: FloatArray = array_m + places[:, None] * line
         x0, y0, x1, y1 = scenario.room_m
         elsewhere = np.array(
             [rng.uniform(x0 + 0.3, x1 - 0.3), rng.uniform(y0 + 0.3, y1 - 0.3), rng.uniform(0.4, 1.4)]
         )
-        self._device = Channel(scenario, np.array(scenario.device_m), self.antennas_m, rng)
-        self._other = Channel(scenario, elsewhere, self.antennas_m, rng)
+        self._link = Channel(scenario, sender_m, self.antennas_m, rng, surroundings)
+        self._other = Channel(scenario, elsewhere, self.antennas_m, rng, surroundings)
         self._nic = Nic(n_rx, rng)
         self._device_mac = mac_from_text(scenario.device_mac)
+        self._sender_mac = self._device_mac if array_end == "hub" else HUB_MAC
         self._first_slot = int(np.ceil(scenario.join_s * packets_per_s))
         self._nic_start_s = rng.uniform(0, 4294.0)
         self._nic_ppm = rng.uniform(-15, 15)
@@ -148,7 +168,8 @@ class Radio:
         for t_s, mac, count, body in zip(
             batch.t_s.tolist(), batch.mac.tolist(), batch.bfee_count.tolist(), csi, strict=True
         ):
-            frame = data_frame(mac, HUB_MAC, HUB_MAC, count, _PAYLOAD)
+            to = self._device_mac if mac == HUB_MAC else HUB_MAC
+            frame = data_frame(mac, to, HUB_MAC, count, _PAYLOAD)
             out.append((t_s, record(FRAME_CODE, frame)))
             out.append((t_s, record(BFEE_CODE, body)))
         out += [
@@ -165,14 +186,14 @@ class Radio:
         slots = np.arange(max(start_slot, self._first_slot), start_slot + _BLOCK_SLOTS)
         n = max(len(slots), 0)
         # The card needs a packet's air time between two: no two nearer than a tenth of a slot.
-        device_t = (slots + rng.uniform(0.05, 0.95, _BLOCK_SLOTS)[_BLOCK_SLOTS - n :]) / self._rate_hz
+        link_t = (slots + rng.uniform(0.05, 0.95, _BLOCK_SLOTS)[_BLOCK_SLOTS - n :]) / self._rate_hz
         other_t = (start_slot + np.sort(rng.uniform(0, _BLOCK_SLOTS, _OTHERS_PER_BLOCK))) / self._rate_hz
-        order = np.argsort(np.concatenate([device_t, other_t]), kind="stable")
-        t_s = np.concatenate([device_t, other_t])[order]
-        is_device = order < n
+        order = np.argsort(np.concatenate([link_t, other_t]), kind="stable")
+        t_s = np.concatenate([link_t, other_t])[order]
+        is_link = order < n
 
-        channel = np.concatenate([self._device.response(device_t), self._other.response(other_t)])[order]
-        floor = np.where(is_device, self._device.still_power, self._other.still_power)
+        channel = np.concatenate([self._link.response(link_t), self._other.response(other_t)])[order]
+        floor = np.where(is_link, self._link.still_power, self._other.still_power)
         readings = self._nic.read(t_s, channel, floor, rng)
         seen_before = block * _OTHERS_PER_BLOCK + max(0, start_slot - self._first_slot)
         nic_us = np.rint((t_s * (1 + self._nic_ppm * 1e-6) + self._nic_start_s) * 1e6).astype(np.int64)
@@ -189,7 +210,7 @@ class Radio:
             rate=rate[kept],
             bfee_count=((seen_before + kept) & 0xFFFF).astype(np.uint16),
             nic_us=(nic_us[kept] & 0xFFFF_FFFF).astype(np.uint32),
-            mac=np.where(is_device, self._device_mac, OTHER_MAC)[kept],
+            mac=np.where(is_link, self._sender_mac, OTHER_MAC)[kept],
             legacy_t_s=legacy_t,
             legacy_frames=legacy,
         )

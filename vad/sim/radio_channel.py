@@ -8,6 +8,8 @@ each packet's time. Amplitudes are relative to free space at 1 m.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,6 +30,22 @@ WALL_LOSS = 0.5
 TORSO_RCS_M2 = 0.3
 _SHADOW_DEPTH, _SHADOW_WIDTH_M = 0.75, 0.2
 _NEAR_M = 0.3  # scatterers are not points: amplitudes stop growing nearer than this
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """How strongly a room speaks back: ranges from which each wall and each thing is drawn.
+
+    reflection: amplitude that a wall, floor or ceiling keeps; things: how many still scatterers, the upper
+    end left out; thing_rcs_m2: their radar cross sections. The defaults are a furnished home.
+    """
+
+    reflection: tuple[float, float] = (0.25, 0.5)
+    things: tuple[int, int] = (5, 11)
+    thing_rcs_m2: tuple[float, float] = (0.1, 1.5)
+
+
+FURNISHED = Surroundings()
 
 
 def _distance(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -63,27 +81,33 @@ def path_sum(gain: FloatArray, length_m: FloatArray) -> ComplexArray:
 
 
 class Channel:
-    """The channel from one transmitter to the hub's antennas.
+    """The channel from one transmitter to the array at the link's other end.
 
     Args:
         scenario: the home.
-        transmitter_m: (3,) the device's antenna.
-        antennas_m: (R, 3) the hub's antennas.
+        transmitter_m: (3,) the sender's antenna.
+        antennas_m: (R, 3) the receiver's antennas.
         rng: draws furniture and what the walls are made of.
+        surroundings: what it draws them from.
     """
 
     def __init__(
-        self, scenario: Scenario, transmitter_m: FloatArray, antennas_m: FloatArray, rng: np.random.Generator
+        self,
+        scenario: Scenario,
+        transmitter_m: FloatArray,
+        antennas_m: FloatArray,
+        rng: np.random.Generator,
+        surroundings: Surroundings = FURNISHED,
     ) -> None:
         self._tracks = tuple(BodyTrack(walk) for walk in scenario.walks)
         self._tx, self._rx = transmitter_m, antennas_m
         x0, y0, x1, y1 = scenario.room_m
-        behind = bool(transmitter_m[0] > x1)
+        behind = bool(max(transmitter_m[0], antennas_m[:, 0].mean()) > x1)
         self._through = WALL_LOSS if behind else 1.0
         far_x = scenario.plan_m[2] if behind else x1
         # A mirror plane: axis, coordinate. Behind the wall the next room's far wall takes this wall's part.
         mirrors = ((0, x0), (0, far_x), (1, y0), (1, y1), (2, 0.0), (2, CEILING_M))
-        keep = rng.uniform(0.25, 0.5, len(mirrors))
+        keep = rng.uniform(*surroundings.reflection, len(mirrors))
         tx_images, rx_images = [], []
         for axis, at_m in mirrors:
             flip = np.ones(3)
@@ -92,7 +116,7 @@ class Channel:
             shift[axis] = 2 * at_m
             tx_images.append(transmitter_m * flip + shift)
             rx_images.append(antennas_m * flip + shift)
-        self._static = self._still(np.array(tx_images), keep, scenario.room_m, rng)
+        self._static = self._still(np.array(tx_images), keep, scenario.room_m, rng, surroundings)
         line = _distance(transmitter_m, antennas_m)
         self._sight = path_sum(np.array([[self._through / line.mean()]]), line[None, None])[0]
         # The person is reached directly, or with one bounce before or after: the ghosts of the Doppler.
@@ -106,10 +130,11 @@ class Channel:
         keep: FloatArray,
         room_m: tuple[float, float, float, float],
         rng: np.random.Generator,
+        surroundings: Surroundings,
     ) -> ComplexArray:
         """Reflections and furniture, (R, 30); the line of sight is apart because people block it."""
         walls = _distance(images_m[:, None], self._rx)
-        count = int(rng.integers(5, 11))
+        count = int(rng.integers(*surroundings.things))
         x0, y0, x1, y1 = room_m
         things = np.column_stack(
             [
@@ -120,7 +145,7 @@ class Channel:
         )
         to_thing = _distance(self._tx, things)[:, None]
         from_thing = _distance(things[:, None], self._rx)
-        rcs = rng.uniform(0.1, 1.5, count)
+        rcs = rng.uniform(*surroundings.thing_rcs_m2, count)
         thing_gain = _scatter_gain(rcs, to_thing[:, 0], from_thing.mean(axis=1))
         gain = np.concatenate([keep / walls.mean(axis=1), thing_gain]) * self._through
         lengths = np.concatenate([walls, to_thing + from_thing])
