@@ -10,8 +10,13 @@ from pathlib import Path
 
 import pytest
 import pytest_asyncio
+from hypothesis import settings
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as vad.cli does, before NumPy is imported
+
+# How long an example takes says how busy the machine is, not whether the code is right.
+settings.register_profile("vad", deadline=None)
+settings.load_profile("vad")
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
