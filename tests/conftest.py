@@ -15,7 +15,8 @@ from hypothesis import settings
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as vad.cli does, before NumPy is imported
 
 # How long an example takes says how busy the machine is, not whether the code is right.
-settings.register_profile("vad", deadline=None)
+# In CI every run tries the same examples; elsewhere each run looks for new ones.
+settings.register_profile("vad", deadline=None, derandomize="CI" in os.environ)
 settings.load_profile("vad")
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
