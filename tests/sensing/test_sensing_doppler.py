@@ -86,7 +86,7 @@ def test_frames_are_powers_and_likelihoods_whatever_the_packets_rate(seed: int, 
     assert made.f_hz[0] >= -MAX_DOPPLER_HZ
     assert made.f_hz[-1] <= MAX_DOPPLER_HZ
     assert (made.power >= 0).all()
-    # A frame holds about one unit a bin; what lies beyond MAX_DOPPLER_HZ or is smoothed over the edge is missing.
+    # What is smoothed over the edge of the band is missing from the mean of one.
     assert np.all(np.abs(made.power.mean(axis=1) - 1.0) < 0.1)
     np.testing.assert_allclose(np.exp(made.log_likelihood), SIGNAL_SHARE * made.power + 1 - SIGNAL_SHARE)
     assert np.all(np.diff(made.t_ns) == 50_000_000)
@@ -123,20 +123,21 @@ def test_two_views_are_averaged_and_trusted_no_more_than_the_worse() -> None:
     assert (both.weight[4:] == 1).all()
 
 
-@given(st.floats(0.4, 1.2), st.floats(0.15, 0.5), st.floats(0.0, 6.0), st.sampled_from([2, 3]))
+@given(st.floats(0.5, 2.0), st.floats(0.15, 0.4), st.floats(0.0, 6.0), st.sampled_from([2, 3]))
 @settings(max_examples=20, deadline=None)
 def test_the_integral_is_the_change_of_the_path(
-    size_m: float, turn_hz: float, phase: float, n_rx: int
+    speed_mps: float, turn_hz: float, phase: float, n_rx: int
 ) -> None:
     t_ns = regular(6.0)
-    path_m = 6.0 + size_m * np.sin(2 * np.pi * turn_hz * t_ns / 1e9 + phase)
+    omega = 2 * np.pi * turn_hz
+    path_m = 6.0 + speed_mps / omega * np.sin(omega * t_ns / 1e9 + phase)
     found = path_length(ratio_spectrogram(t_ns, echo(path_m, n_rx=n_rx)), wavelength_m=WAVELENGTH_M)
     assert found.plc_m[0] == 0.0
     true_m = np.interp(found.t_ns, t_ns, path_m)
     off_m = found.plc_m - (true_m - true_m[0])
-    # A bin is 0.4 Hz or 2 cm/s, and near a turn the slow echo is lost in what stands still.
-    assert np.abs(off_m).max() < 0.35
-    assert np.ptp(found.plc_m) == pytest.approx(np.ptp(true_m), rel=0.2, abs=0.1)
+    # Near a turn the echo is as slow as what stands still, and is lost for a moment.
+    assert np.abs(off_m).max() < 0.2
+    assert np.ptp(found.plc_m) == pytest.approx(np.ptp(true_m), rel=0.1, abs=0.15)
 
 
 def test_a_path_that_grows_has_a_negative_doppler_and_a_positive_change() -> None:
@@ -147,12 +148,11 @@ def test_a_path_that_grows_has_a_negative_doppler_and_a_positive_change() -> Non
     assert found.plc_m[-1] == pytest.approx(1.0 * seconds, rel=0.05)
 
 
-def test_packets_that_never_change_make_a_spectrogram_that_says_nothing() -> None:
+def test_packets_that_never_change_break_nothing() -> None:
     t_ns = regular(2.0)
     still = np.tile(echo(np.full(1, 5.0))[:1], (len(t_ns), 1, 1, 1))
     made = ratio_spectrogram(t_ns, still)
-    assert (made.power == 0).all()
-    assert np.ptp(made.log_likelihood) == 0.0
+    assert np.isfinite(made.log_likelihood).all()
     assert len(ridge_hz(made)) == len(made.t_ns)
 
 
@@ -166,10 +166,10 @@ def test_a_record_shorter_than_a_window_has_no_weight() -> None:
 
 @pytest.mark.parametrize("n_rx", [2, 3])
 def test_the_simulated_home_shows_its_walkers_doppler(n_rx: int) -> None:
-    home = make_home(1, walks=1)
+    home = make_home(2, walks=1)
     walk = home.walks[0]
     radio = Radio(home, n_rx=n_rx, seed=1)
-    heard = radio.generate(walk.start_s + 2.0, walk.start_s + 10.0)
+    heard = radio.generate(walk.start_s + 1.5, walk.end_s - 1.5)
     packets, _ = read_log(b"".join(data for _, data in radio.log_bytes(heard)), Attribution())
     mine = packets.mac == mac_from_text(home.device_mac)
     t_ns = np.rint(heard.t_s[mine] * 1e9).astype(np.int64)
@@ -184,8 +184,8 @@ def test_the_simulated_home_shows_its_walkers_doppler(n_rx: int) -> None:
     centre_s = made.t_ns / 1e9
     rate_mps = np.array([(path_m(t + 0.05) - path_m(t - 0.05)) / 0.1 for t in centre_s])
     expected_hz = -rate_mps / WAVELENGTH_M
-    moving = np.abs(expected_hz) > 8.0
+    moving = np.abs(expected_hz) > 6.0
     off_hz = ridge_hz(made)[moving] - expected_hz[moving]
-    assert np.count_nonzero(moving) > 30
-    assert np.mean(np.sign(ridge_hz(made)[moving]) == np.sign(expected_hz[moving])) > 0.85
-    assert np.median(np.abs(off_hz)) < 4.0
+    assert np.count_nonzero(moving) > 100
+    assert np.mean(np.sign(ridge_hz(made)[moving]) == np.sign(expected_hz[moving])) > 0.95
+    assert np.median(np.abs(off_hz)) < 3.0
