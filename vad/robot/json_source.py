@@ -9,7 +9,7 @@ Schema, one object per message:
 | sigma_m | number > 0, optional | standard deviation of x and y; 0.05 if absent |
 | sigma_yaw_rad | number > 0, optional | standard deviation of the yaw; 0.05 if absent |
 | t_ns | integer, optional | CLOCK_MONOTONIC of the hub; only for a robot program that runs on the hub |
-| status | text, optional | `localised` if absent, `docked`; `not_localised`, `lifted`, `lost`: without place |
+| status | text, optional | `localised` if absent, `docked`; `not_localised`, `lifted`, `lost`: no place |
 
 Other keys are ignored. Without t_ns the time of arrival counts. A robot says where it is 2 to 50 times a
 second, at rest too; after 2 s without a pose it counts as silent.
