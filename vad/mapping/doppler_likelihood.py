@@ -26,7 +26,8 @@ SPEED_OF_LIGHT_MPS = 299_792_458.0
 
 @dataclass(frozen=True, slots=True)
 class DopplerModel:
-    """What is assumed of the walk. Heights are those of the ends above or below the torso.
+    """What is assumed of the walk. Heights are those of the ends above or below the torso: the first two
+    where no height is known, device_off_torso_m (usual in a home) where the anchor's is.
 
     deviation_per_sigma: standard deviation of the path's deviation, in units of the track's stated sigma_m
     (two ends see the same error; recorded tracks understate their errors in time); correlation_s: how long
@@ -37,6 +38,7 @@ class DopplerModel:
     kappas: tuple[float, ...] = (0.86, 0.93, 1.0)
     torso_z_m: float = 1.05
     device_above_torso_m: float = 0.8
+    device_off_torso_m: float = 0.4
     anchor_above_torso_m: float = 1.0
     deviation_per_sigma: float = 1.7
     min_deviation_m: float = 0.05
@@ -70,7 +72,8 @@ def predicted_doppler_hz(
     position, velocity = walk.position_m(t_ns), walk.velocity_mps(t_ns)
     anchor_dz = model.anchor_above_torso_m if anchor_z_m is None else anchor_z_m - model.torso_z_m
     anchor_rate = _range_rate(position[:, None] - anchor_m, velocity, anchor_dz)
-    device_rate = _range_rate(position[:, None] - points_m[None], velocity, model.device_above_torso_m)
+    device_dz = model.device_above_torso_m if anchor_z_m is None else model.device_off_torso_m
+    device_rate = _range_rate(position[:, None] - points_m[None], velocity, device_dz)
     return np.asarray(-(anchor_rate + device_rate) / wavelength_m)
 
 

@@ -12,7 +12,7 @@ from vad.mapping.posterior import Grid, Posterior
 
 FloatArray = NDArray[np.float64]
 
-HEARD_SHARE = 0.75
+HEARD_SHARE = 1.0
 DOPPLER_CORRELATION = 0.25
 ARRIVAL_CORRELATION = 0.5
 """Walks through one room share their multipath and the walker's ways: n walks count as n / (1 + (n - 1) c)
