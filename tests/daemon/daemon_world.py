@@ -134,11 +134,11 @@ class Vad:
         return self._process.poll() is None
 
     @property
-    def holds_signals(self) -> bool:
-        """True from the program's first line until it is ready to end on a signal."""
+    def catches_signals(self) -> bool:
+        """True from the program's first line on; before, there is Python alone."""
         status = Path(f"/proc/{self._process.pid}/status").read_text()
-        (blocked,) = (int(line.split()[1], 16) for line in status.splitlines() if line.startswith("SigBlk:"))
-        return bool(blocked & 1 << (signal.SIGTERM - 1))
+        (caught,) = (int(line.split()[1], 16) for line in status.splitlines() if line.startswith("SigCgt:"))
+        return bool(caught & 1 << (signal.SIGTERM - 1))
 
     def send(self, number: signal.Signals) -> None:
         """Send a signal."""

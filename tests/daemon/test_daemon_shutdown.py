@@ -59,11 +59,10 @@ def session_states(settings: Path) -> list[str]:
 def test_while_it_loads_and_opens(tmp_path: Path, number: signal.Signals) -> None:
     with home(tmp_path) as (settings, port):
         with daemon(settings) as vad:
-            wait_for(lambda: vad.holds_signals, "its first line")
+            wait_for(lambda: vad.catches_signals, "its first line")
             vad.end(number)
         with daemon(settings) as vad:
-            wait_for(lambda: vad.holds_signals, "its first line")
-            wait_for(lambda: not vad.holds_signals, "that it opens")
+            wait_for((settings.parent / "state" / "vad.sqlite").exists, "that it opens")
             vad.end(number)
         # What it had opened is free again.
         with daemon(settings) as vad, closing(connect(vad, port)) as client:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import typer
 
 from vad import __version__
+from vad.commands import loading
 from vad.commands.csi import csi_app
 from vad.commands.demo import demo
 from vad.commands.devices import devices
@@ -13,12 +14,8 @@ from vad.commands.map import map_app
 from vad.commands.replay import replay
 from vad.commands.robot import app as robot_app
 from vad.commands.run import check_config, run
-from vad.commands.signals import release
 from vad.commands.sim import sim
 from vad.commands.status import status
-
-RELEASES_ITSELF = ("run", "sim")
-"""Commands that deliver the held signals when they are ready to end on them."""
 
 app = typer.Typer(
     name="vad",
@@ -41,8 +38,7 @@ def _vad(
     context: typer.Context,
     version: bool = typer.Option(False, "--version", callback=_version, is_eager=True),
 ) -> None:
-    if context.invoked_subcommand not in RELEASES_ITSELF:
-        release()
+    loading.finish(context.invoked_subcommand)
 
 
 app.command()(run)

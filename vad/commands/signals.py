@@ -1,19 +1,13 @@
-"""SIGINT and SIGTERM, which vad.cli holds back while the program loads, and how a program ends on them."""
+"""How a program that runs until it is told to stop ends on SIGINT and SIGTERM."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import signal
 from collections.abc import Coroutine
 from typing import Any
 
-ENDINGS = (signal.SIGINT, signal.SIGTERM)
-
-
-def release() -> None:
-    """Deliver the signals again, those that waited at once."""
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDINGS)
+from vad.commands.loading import ENDINGS
 
 
 async def until_ended(work: Coroutine[Any, Any, None]) -> None:
@@ -22,7 +16,6 @@ async def until_ended(work: Coroutine[Any, Any, None]) -> None:
     running = asyncio.ensure_future(work)
     for number in ENDINGS:
         loop.add_signal_handler(number, _end, running)  # closing the loop removes them
-    release()
     with contextlib.suppress(asyncio.CancelledError):
         await running
 
