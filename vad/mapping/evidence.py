@@ -13,6 +13,9 @@ from vad.mapping.posterior import Grid, Posterior
 FloatArray = NDArray[np.float64]
 
 HEARD_SHARE = 1.0
+HEARD_SHARE_WITH_PHASES = 0.75
+"""How much the walker's loudness counts; less where the antennas' phases tell the range, too."""
+
 DOPPLER_CORRELATION = 0.25
 ARRIVAL_CORRELATION = 0.5
 """Walks through one room share their multipath and the walker's ways: n walks count as n / (1 + (n - 1) c)
@@ -57,7 +60,8 @@ class Terms:
     def log_density(self) -> FloatArray:
         """log p(device at each candidate | all walks), (G,), up to a constant that walks share."""
         n = self.walks
-        total = self.doppler / (1 + (n - 1) * DOPPLER_CORRELATION) + HEARD_SHARE * self.heard / n
+        heard_share = HEARD_SHARE if self.arrival is None else HEARD_SHARE_WITH_PHASES
+        total = self.doppler / (1 + (n - 1) * DOPPLER_CORRELATION) + heard_share * self.heard / n
         if self.arrival is not None:
             total = total + arrival_log_likelihood(
                 self.arrival, weight=1 / (1 + (n - 1) * ARRIVAL_CORRELATION)
