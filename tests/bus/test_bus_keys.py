@@ -36,6 +36,10 @@ def test_keys_are_the_designs_and_legal() -> None:
         keys.device(MAC.upper()): ParsedKey("home", "device", MAC),
         keys.heatmap(MAC): ParsedKey("home", "heatmap", MAC),
         keys.capture("s-1"): ParsedKey("home", "capture", "s-1"),
+        keys.agent_alive("attic"): ParsedKey("home", "agent_alive", "attic"),
+        keys.agent_clock("attic"): ParsedKey("home", "agent_clock", "attic"),
+        keys.agent_cmd("attic"): ParsedKey("home", "agent_cmd", "attic"),
+        keys.agent_csi("attic"): ParsedKey("home", "agent_csi", "attic"),
     }
     assert keys.device(MAC) == f"vad/home/devices/{MAC}"
     for key, parsed in built.items():

@@ -82,6 +82,25 @@ class HubKeys:
         """CaptureMessage of one capture session, or the pattern of all."""
         return self._key("capture", ANY if session == ANY else chunk(session))
 
+    def agent_alive(self, agent: str = ANY) -> str:
+        """The liveliness token of a remote CSI node; a query on this key is answered with its AgentInfo."""
+        return self._agent(agent, "alive")
+
+    def agent_clock(self, agent: str = ANY) -> str:
+        """Where an agent asks the hub for its clock."""
+        return self._agent(agent, "clock")
+
+    def agent_cmd(self, agent: str = ANY) -> str:
+        """What the hub tells an agent: the handshake, what has arrived."""
+        return self._agent(agent, "cmd")
+
+    def agent_csi(self, agent: str = ANY) -> str:
+        """An agent's stream: CSI in batches, and its answers in the handshake."""
+        return self._agent(agent, "csi")
+
+    def _agent(self, agent: str, what: str) -> str:
+        return self._key("agents", ANY if agent == ANY else chunk(agent), what)
+
 
 @dataclass(frozen=True, slots=True)
 class ParsedKey:
@@ -100,6 +119,7 @@ _FIXED = {
     ("events",): "events",
 }
 _NAMED = {"cameras": "camera", "devices": "device", "capture": "capture"}
+_OF_AGENTS = ("alive", "clock", "cmd", "csi")
 
 
 def parse_key(key: str) -> ParsedKey | None:
@@ -115,4 +135,6 @@ def parse_key(key: str) -> ParsedKey | None:
         return ParsedKey(hub, _NAMED[parts[0]], parts[1])
     if len(parts) == 3 and parts[0] == "devices" and parts[1] and parts[2] == "heatmap":
         return ParsedKey(hub, "heatmap", parts[1])
+    if len(parts) == 3 and parts[0] == "agents" and parts[1] and parts[2] in _OF_AGENTS:
+        return ParsedKey(hub, f"agent_{parts[2]}", parts[1])
     return None
