@@ -173,9 +173,13 @@ class BusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
 
 class CaptureSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """When a device counts as mapped, and how long a capture may be.
+    """When a device counts as mapped, who is measured, how long a capture may be, what is kept.
 
-    mapped_radius_m: 90 % region at which measuring stops; min_walks: at least as many walks.
+    mapped_radius_m: 90 % region at which measuring stops; min_walks: at least as many walks. together: how
+    many devices one walk may measure. recheck_h: a mapped device is measured again after so many hours: was
+    it moved? 0 = never. airtime_percent: what provoked packets may take of the channel's time,
+    averaged over an hour. quota_mb: session folders together, the oldest go first; keep_free_mb: what they
+    leave free on their disk. keep_frames: the walk's pictures, too (people are on them).
     """
 
     mapped_radius_m: Positive = 0.7
@@ -183,6 +187,12 @@ class CaptureSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     max_walks: Annotated[int, Meta(ge=1)] = 8
     min_s: Positive = 6.0
     max_s: Positive = 30.0
+    together: Annotated[int, Meta(ge=1, le=8)] = 3
+    recheck_h: Annotated[float, Meta(ge=0)] = 24.0
+    airtime_percent: Annotated[float, Meta(ge=0, le=100)] = 2.0
+    quota_mb: Annotated[int, Meta(ge=10)] = 2000
+    keep_free_mb: Annotated[int, Meta(ge=0)] = 500
+    keep_frames: bool = False
 
 
 class VisionSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -21,6 +21,7 @@ from vad.capture.session import (
     load_session,
 )
 from vad.capture.session_writer import SessionWriter
+from vad.csi.attribution import Attribution
 from vad.csi.bfee import encode_bodies
 from vad.csi.dot11 import data_frame
 from vad.csi.logfile import LogReader, record
@@ -54,7 +55,7 @@ def log_bytes(count: int, senders: list[str], *, seed: int = 0) -> bytes:
 
 def batches(raw: bytes, pieces: int) -> list[CsiBatch]:
     """The log as a live source would hand it over."""
-    reader, stamper = LogReader(), Stamper()
+    reader, stamper = LogReader(Attribution()), Stamper()
     cut = np.linspace(0, len(raw), pieces + 1).astype(int)
     fed = [reader.feed(raw[a:b]) for a, b in pairwise(cut)]
     return [stamper.stamp(batch, 10**9 * (k + 1)) for k, batch in enumerate(fed)]
@@ -94,6 +95,8 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "s1" / "session.json").read_text())["capture"] == {
         "state": "done",
         "reason": "",
+        "packets": 300,
+        "walk_s": 0.9,
     }
 
 

@@ -208,8 +208,11 @@ def _arrivals(
             raise SessionError(f"not a NumPy array ({error})", where=str(path)) from error
         if arrival.ndim == 1 and arrival.dtype == np.int64 and len(arrival) >= len(packets):
             return np.asarray(arrival[: len(packets)], dtype=np.int64)
-        if arrival.ndim == 1 and len(arrival) > 0:
-            notes.append(f"csi_arrival.npy has {len(arrival)} times for {len(packets)} packets: not used")
+        if arrival.ndim == 1 and arrival.dtype == np.int64 and len(arrival) > 0:
+            # A crash came between the log and its times: the card's counter tells the last ones.
+            notes.append(f"csi_arrival.npy lacks {len(packets) - len(arrival)} times: they are the card's")
+            rest_us = unwrap_nic_us(packets.nic_us[len(arrival) - 1 :])
+            return np.concatenate([arrival, arrival[-1] + (rest_us[1:] - rest_us[0]) * 1000]).astype(np.int64)
     first_ns = header.clock.csi_first_packet_ns
     if first_ns is None:
         raise SessionError("neither csi_arrival.npy nor clock.csi_first_packet_ns", where=str(folder))
