@@ -22,6 +22,12 @@ from vad.store.records import DeviceRecord, Estimate, PosteriorRecord
 from vad.store.worker import StoreWorker
 
 METHOD = "spectrogram-likelihood"
+STAYS_MAPPED = 1.5
+"""A mapped device is one until its region is this much larger than what made it one."""
+SURE_OF_ROOM = 0.9
+NEGLIGIBLE = 1e-6
+"""Cells below this share do not decide a room."""
+DOUBTED = "its last walk says that it is elsewhere: it is measured again"
 
 
 class Registry:
@@ -127,15 +133,49 @@ class Registry:
         """A capture of this device has begun."""
         await self._keep(replace(self._devices[mac], state="capturing", reason=""))
 
-    async def add_evidence(self, mac: str, evidence: Posterior, packets: int, walk_s: float) -> PlaceEstimate:
-        """Multiply one walk's posterior into what is known; decide whether that makes a mapped device."""
+    async def known_posterior(self, mac: str, grid: Grid) -> Posterior | None:
+        """What all walks so far say together; None where nothing of this map epoch is known."""
         known = self._devices[mac]
-        before = await self._posterior_of(known, evidence.grid)
+        before = await self._posterior_of(known, grid)
+        return None if before is None else joint_posterior(before, known.walks)
+
+    async def doubt(self, mac: str, *, on: bool) -> None:
+        """Say, or say no more, that the last walk contradicts the map."""
+        known = self._devices[mac]
+        if on and known.state == "mapped":
+            await self._keep(replace(known, reason=DOUBTED))
+        elif not on and known.reason == DOUBTED:
+            await self._keep(replace(known, reason=""))
+
+    async def unchanged(self, before: DeviceRecord) -> None:
+        """A capture told nothing: state and reason are again what they were `before` it."""
+        known = self._devices[before.mac]
+        if (known.state, known.reason) != (before.state, before.reason):
+            await self._keep(replace(known, state=before.state, reason=before.reason))
+
+    def say_moved(self, mac: str, text: str) -> None:
+        """Tell subscribers that the device was carried elsewhere."""
+        self._event("moved", mac, text)
+
+    def room_at(self, x_m: float, y_m: float) -> str | None:
+        """The room of a place of the present map."""
+        return self._plan.room_at(x_m, y_m)
+
+    async def add_evidence(
+        self, mac: str, evidence: Posterior, packets: int, walk_s: float, *, anew: bool = False
+    ) -> PlaceEstimate:
+        """Multiply one walk's posterior into what is known; decide whether that makes a mapped device.
+
+        anew: what was known before is dropped.
+        """
+        known = self._devices[mac]
+        before = None if anew else await self._posterior_of(known, evidence.grid)
         fresh = before is None
         total = evidence if before is None else before.fused(evidence)
         walks = 1 if fresh else known.walks + 1
         place = place_from_posterior(joint_posterior(total, walks))
-        state, reason = self._verdict(place, walks)
+        was_mapped = not anew and known.state == "mapped"
+        state, reason = self._verdict(place, walks, was_mapped, joint_posterior(total, walks))
         counts = {} if fresh else known.evidence
         record = replace(
             known,
@@ -166,15 +206,34 @@ class Registry:
             self._event("mapped", mac, f"{known.name or mac} is mapped{where}, ±{place.radius90_m:.1f} m")
         return place
 
-    def _verdict(self, place: PlaceEstimate, walks: int) -> tuple[str, str]:
+    def _verdict(
+        self, place: PlaceEstimate, walks: int, was_mapped: bool, posterior: Posterior
+    ) -> tuple[str, str]:
+        """State and reason after `walks` walks. Where walks of this kind do not make it sharp, a sure room is
+        an answer, too."""
         capture = self._settings.capture
-        sharp = place.status == "located" and place.radius90_m <= capture.mapped_radius_m
-        if sharp and walks >= capture.min_walks:
+        enough_m = capture.mapped_radius_m * (STAYS_MAPPED if was_mapped else 1.0)
+        located = place.status == "located"
+        if located and place.radius90_m <= enough_m and walks >= capture.min_walks:
             return "mapped", ""
-        if walks >= capture.max_walks:
-            size = _size(place.radius90_m, walks)
-            return "failed", f"{size}: more walks of this kind do not tell; walk elsewhere in the picture"
-        return "waiting", _another_walk(place.radius90_m, walks)
+        if walks < capture.max_walks:
+            return "waiting", _another_walk(place.radius90_m, walks)
+        size = _size(place.radius90_m, walks)
+        room, share = self._likeliest_room(posterior)
+        if located and room == self._plan.room_at(*place.xy_m.tolist()) and share >= SURE_OF_ROOM:
+            return (
+                "mapped",
+                f"{size}: the room is sure to {share:.0%}, more walks of this kind do not tell",
+            )
+        return "failed", f"{size}: more walks of this kind do not tell; walk elsewhere in the picture"
+
+    def _likeliest_room(self, posterior: Posterior) -> tuple[str | None, float]:
+        """The room with the largest share of the posterior, and that share."""
+        shares: dict[str, float] = {}
+        for (x_m, y_m), p in zip(posterior.grid.points_m, posterior.probability.ravel(), strict=True):
+            if p > NEGLIGIBLE and (room := self._plan.room_at(x_m, y_m)) is not None:
+                shares[room] = shares.get(room, 0.0) + float(p)
+        return max(shares.items(), key=lambda item: item[1], default=(None, 0.0))
 
     def _stale(self, record: DeviceRecord) -> str:
         """Why the coordinates of a record no longer hold; empty when they do."""
