@@ -32,6 +32,19 @@ def device(i: int = 0, **changes: object) -> m.DeviceMessage:
     return m.DeviceMessage(**(fields | changes))  # type: ignore[arg-type]
 
 
+BROKEN_HEATMAP = m.HeatmapMessage(
+    source="live",
+    mac=mac(0),
+    epoch=1,
+    bounds_m=(0, 0, 3, 2),
+    step_m=1,
+    width=3,
+    height=2,
+    probability=b"no zlib",
+)
+"""What only a fault of ours could publish."""
+
+
 def settings(endpoint: str, hub: str = "home") -> BusSettings:
     return BusSettings(hub=hub, listen=(endpoint,))
 

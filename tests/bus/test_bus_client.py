@@ -9,7 +9,7 @@ import threading
 import zlib
 
 import pytest
-from bus_world import ROOT, device, mac, settings, until
+from bus_world import BROKEN_HEATMAP, ROOT, device, mac, settings, until
 
 from vad.bus import messages as m
 from vad.bus.node import Bus
@@ -20,18 +20,18 @@ from vad.errors import ProtocolError
 
 async def test_the_client_says_what_the_daemon_refused(endpoint: str) -> None:
     def ask() -> None:
-        with VadClient(endpoint) as client, pytest.raises(QueryError, match="ValueError") as caught:
-            client.devices(max_sigma_m=1.0)
+        with VadClient(endpoint) as client, pytest.raises(QueryError, match="ProtocolError") as caught:
+            client.heatmap_png(mac(0))
         assert caught.value.code == "internal"
 
     async with Bus(settings(endpoint)) as bus:
-        bus.publish_device(device(0, covariance_m2=(1, 2, 3)))
+        bus.publish_heatmap(BROKEN_HEATMAP)
         await asyncio.to_thread(ask)
 
 
 async def test_a_message_of_another_version_is_said_so(endpoint: str) -> None:
     def ask() -> None:
-        with VadClient(endpoint) as client, pytest.raises(ProtocolError, match=r"not vad\.device\.v1"):
+        with VadClient(endpoint) as client, pytest.raises(ProtocolError, match=r"not vad\.devices\.v1"):
             client.devices()
 
     async with Bus(settings(endpoint)) as bus:

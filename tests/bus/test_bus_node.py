@@ -8,11 +8,12 @@ import time
 import numpy as np
 import pytest
 import zenoh
-from bus_world import ask_raw, device, mac, settings, until
+from bus_world import BROKEN_HEATMAP, ask_raw, device, mac, settings, until
 
 from vad.bus import messages as m
 from vad.bus.grid import grid_to_png
 from vad.bus.node import KEPT_CAPTURES, Bus
+from vad.bus.schemas import json_schemas
 from vad.bus.session import BusSettings, open_session
 from vad.client import VadClient
 from vad.errors import VadError
@@ -90,10 +91,14 @@ async def test_what_is_published_carries_its_encoding(endpoint: str) -> None:
         bus.publish_grid(b"png")
         replies = await asyncio.to_thread(ask_raw, endpoint, "vad/home/**")
         encodings = {str(r.ok.key_expr): str(r.ok.encoding) for r in replies if r.ok is not None}
+        schemas = {key: encodings.pop(key) for key in list(encodings) if "/schema/" in key}
         assert encodings == {
             f"vad/home/devices/{mac(0)}": "application/json;vad.device.v1",
             "vad/home/map/grid": "image/png",
+            "vad/home/events": "application/json;vad.events.v1",
         }
+        assert set(schemas) == {f"vad/home/schema/{name}" for name in json_schemas()}
+        assert set(schemas.values()) == {"application/schema+json"}
 
 
 async def test_selectors_narrow(endpoint: str) -> None:
@@ -126,21 +131,28 @@ async def test_selectors_narrow(endpoint: str) -> None:
         ("vad/home/devices/*?colour=red", "bad_selector", "'colour' is not a selector"),
         ("vad/*/devices/*?state=maped", "bad_selector", "'maped' is not a device state"),
         ("vad/home/status?room=Hall", "bad_selector", "takes no selectors"),
-        ("vad/home/devices/*?max_sigma_m=1", "internal", "ValueError"),
+        ("vad/home/devices/*?max_sigma_m=x", "bad_selector", "not a number"),
+        ("vad/home/devices?bbox=1,2,3", "bad_selector", "3 numbers"),
+        ("vad/home/devices?at=yesterday", "bad_selector", "not an RFC 3339 time"),
+        ("vad/home/devices?format=xml", "bad_selector", "'xml' is no form"),
+        ("vad/home/devices/*/history", "bad_selector", "one device at a time"),
+        (f"vad/home/devices/{mac(0)}?at=2026-01-01T00:00:00Z", "not_available", "keeps no history"),
+        (f"vad/home/devices/{mac(0)}/heatmap?format=png", "internal", "ProtocolError"),
     ],
 )
 async def test_a_refused_question_gets_a_code_and_a_sentence(
     endpoint: str, selector: str, code: str, text: str
 ) -> None:
     async with Bus(settings(endpoint)) as bus:
-        bus.publish_device(device(0, covariance_m2=(1, 2, 3)))  # a covariance of no shape: a fault of ours
+        bus.publish_device(device(0))
+        bus.publish_heatmap(BROKEN_HEATMAP)
         bus.publish_status(m.StatusMessage(source="live", version="1", uptime_s=0.0))
         (reply,) = await asyncio.to_thread(ask_raw, endpoint, selector)
         assert reply.err is not None
         refused = m.decode(reply.err.payload.to_bytes(), m.ErrorMessage)
         assert refused.code == code
         assert text in refused.text
-        counter = "refused" if code == "bad_selector" else "failed"
+        counter = "failed" if code == "internal" else "refused"
         await until(lambda: bus.health.counters[counter] == 1, counter)
         assert bus.health.counters["queries"] == 1
 
@@ -178,7 +190,9 @@ async def test_subscribers_hear_changes_only(endpoint: str) -> None:
             ]
             await until(lambda: len(heard) >= len(expected), "all heard")
         assert heard == expected
-        answered = m.decode(bus._tables["vad/home/status"]["vad/home/status"].payload, m.StatusMessage)
+        answered = m.decode(
+            bus._board.tables["vad/home/status"]["vad/home/status"].form.payload, m.StatusMessage
+        )
         assert answered.uptime_s == 3.0, "a question gets the uptime that was not worth a put"
         assert status.uptime_s == 1.0
 
@@ -212,5 +226,5 @@ async def test_only_the_last_captures_are_kept(endpoint: str) -> None:
     bus = Bus(settings(endpoint))
     for i in range(KEPT_CAPTURES + 3):
         bus.publish_capture(m.CaptureMessage(source="live", session=f"s{i}", mac=mac(0), state="done"))
-    kept = bus._tables["vad/home/capture/*"]
+    kept = bus._board.tables["vad/home/capture/*"]
     assert list(kept) == [f"vad/home/capture/s{i}" for i in range(3, KEPT_CAPTURES + 3)]

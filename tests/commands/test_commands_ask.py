@@ -154,7 +154,7 @@ async def test_exit_codes_tell_nothing_bad_input_and_no_daemon_apart(endpoint: s
         _, complaint = await run(endpoint, command, code=3)
         assert f"no vad daemon answers at {endpoint}. Start it" in complaint
         _, complaint = await run("tcp/192.168.1.1:7447", command, code=2)
-        assert "TLS" in complaint
+        assert "plain TCP" in complaint
     async with Bus(BusSettings(listen=(endpoint,))):
         assert "no device is known yet" in (await run(endpoint, "devices", code=1))[1]
         assert "no device fits" in (await run(endpoint, "devices", "--room", "Attic", code=1))[1]

@@ -1,6 +1,8 @@
-"""The occupancy grid as a picture: map_server's greys, so that every image viewer shows a floor plan."""
+"""The occupancy grid and the posterior as pictures; map_server's greys, so that every viewer shows a plan."""
 
 from __future__ import annotations
+
+import io
 
 import cv2
 import numpy as np
@@ -38,3 +40,36 @@ def png_to_grid(png: bytes) -> NDArray[np.int8]:
     grid[grey == FREE_GREY] = 0
     grid[grey == OCCUPIED_GREY] = 100
     return grid[::-1]
+
+
+def heatmap_to_png(probability: NDArray[np.float32]) -> bytes:
+    """PNG of a posterior to lay over the floor plan: warm where the device is, clear where it is not.
+
+    probability: (height, width), row 0 at the bottom. One pixel a cell, colour and opacity by the square root
+    of the share of the peak, so that the flanks show; the picture's first row is the top of the plan.
+    """
+    share = np.sqrt(probability / np.maximum(probability.max(), np.float32(1e-30)))
+    level = np.rint(255 * share).astype(np.uint8)[::-1]
+    colour = cv2.applyColorMap(np.ascontiguousarray(level), cv2.COLORMAP_INFERNO)
+    encoded, data = cv2.imencode(".png", np.dstack([colour, level]))
+    if not encoded:
+        raise ValueError(f"a heatmap of {probability.shape} cells cannot become a picture")
+    return data.tobytes()
+
+
+def heatmap_to_npy(probability: NDArray[np.float32]) -> bytes:
+    """A posterior as a NumPy file, (height, width) little-endian float32, row 0 at y0."""
+    file = io.BytesIO()
+    np.save(file, np.ascontiguousarray(probability, "<f4"), allow_pickle=False)
+    return file.getvalue()
+
+
+def npy_to_heatmap(payload: bytes) -> NDArray[np.float32]:
+    """The (height, width) float32 array that `heatmap_to_npy` wrote; else ProtocolError."""
+    try:
+        found = np.load(io.BytesIO(payload), allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        raise ProtocolError(f"the heatmap is no array: {error}") from error
+    if found.dtype != np.dtype("<f4") or found.ndim != 2:
+        raise ProtocolError(f"the heatmap is {found.dtype} of {found.ndim} axes, not float32 of two")
+    return np.asarray(found, np.float32)

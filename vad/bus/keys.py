@@ -63,8 +63,17 @@ class HubKeys:
 
     @property
     def events(self) -> str:
-        """EventMessage, published only."""
+        """EventMessage as it happens; a query is answered with the last ones in an EventsMessage."""
         return self._key("events")
+
+    def schema(self, name: str = ANY) -> str:
+        """The JSON Schema of one schema id, or the pattern of all."""
+        return self._key("schema", ANY if name == ANY else chunk(name))
+
+    @property
+    def devices(self) -> str:
+        """All devices in one DevicesMessage (or GeoJSON FeatureCollection), on request only."""
+        return self._key("devices")
 
     def camera(self, camera: str = ANY) -> str:
         """CameraMessage of one camera, or the pattern of all."""
@@ -77,6 +86,10 @@ class HubKeys:
     def heatmap(self, mac: str = ANY) -> str:
         """HeatmapMessage of one device, or the pattern of all."""
         return self.device(mac) + "/heatmap"
+
+    def history(self, mac: str = ANY) -> str:
+        """HistoryMessage of one device, on request only, or the pattern of all."""
+        return self.device(mac) + "/history"
 
     def capture(self, session: str = ANY) -> str:
         """CaptureMessage of one capture session, or the pattern of all."""
@@ -117,8 +130,10 @@ _FIXED = {
     ("map",): "map",
     ("map", "grid"): "grid",
     ("events",): "events",
+    ("devices",): "devices",
 }
-_NAMED = {"cameras": "camera", "devices": "device", "capture": "capture"}
+_NAMED = {"cameras": "camera", "devices": "device", "capture": "capture", "schema": "schema"}
+_OF_DEVICES = ("heatmap", "history")
 _OF_AGENTS = ("alive", "clock", "cmd", "csi")
 
 
@@ -133,8 +148,8 @@ def parse_key(key: str) -> ParsedKey | None:
         return ParsedKey(hub, _FIXED[parts])
     if len(parts) == 2 and parts[0] in _NAMED and parts[1]:
         return ParsedKey(hub, _NAMED[parts[0]], parts[1])
-    if len(parts) == 3 and parts[0] == "devices" and parts[1] and parts[2] == "heatmap":
-        return ParsedKey(hub, "heatmap", parts[1])
+    if len(parts) == 3 and parts[0] == "devices" and parts[1] and parts[2] in _OF_DEVICES:
+        return ParsedKey(hub, parts[2], parts[1])
     if len(parts) == 3 and parts[0] == "agents" and parts[1] and parts[2] in _OF_AGENTS:
         return ParsedKey(hub, f"agent_{parts[2]}", parts[1])
     return None

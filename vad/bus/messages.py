@@ -72,6 +72,36 @@ class DeviceMessage(Message, frozen=True, kw_only=True):
         return math.sqrt(max(0.0, (a + c) / 2 + math.hypot((a - c) / 2, b)))
 
 
+class DevicesMessage(Message, frozen=True, kw_only=True):
+    """Several devices in one answer, by MAC; each is the message of its own key."""
+
+    schema: Literal["vad.devices.v1"] = "vad.devices.v1"
+    devices: tuple[DeviceMessage, ...]
+
+
+class HistoryEntry(msgspec.Struct, frozen=True, kw_only=True):
+    """What was said of a device from `at` (RFC 3339, UTC) to the next entry; coordinates in map `epoch`."""
+
+    at: str
+    state: DeviceState
+    epoch: int
+    x_m: float | None = None
+    y_m: float | None = None
+    covariance_m2: Matrix2 | None = None
+    radius90_m: float | None = None
+    room: str | None = None
+    name: str | None = None
+    walks: int = 0
+
+
+class HistoryMessage(Message, frozen=True, kw_only=True):
+    """How a device came to be where it is: the newest entry first."""
+
+    schema: Literal["vad.history.v1"] = "vad.history.v1"
+    mac: str
+    entries: tuple[HistoryEntry, ...] = ()
+
+
 class CameraMessage(Message, frozen=True, kw_only=True):
     """A camera's place and how good it is.
 
@@ -135,14 +165,30 @@ class HeatmapMessage(Message, frozen=True, kw_only=True):
     probability: bytes
 
 
+class Latency(msgspec.Struct, frozen=True, kw_only=True):
+    """How long one kind of work took: `count` times in all; median, 99th percentile and longest of late."""
+
+    count: int
+    p50_ms: float
+    p99_ms: float
+    max_ms: float
+
+
 class Part(msgspec.Struct, frozen=True, kw_only=True):
-    """Health of one part of the daemon."""
+    """Health of one part of the daemon.
+
+    last_error: the reason for the last trouble, last_error_at: when that began. counters: since the start;
+    rates_per_s: of those counters that moved, over the last seconds.
+    """
 
     part: str
     state: PartState
     detail: str = ""
     last_error: str = ""
+    last_error_at: str | None = None
     counters: dict[str, int] = {}
+    rates_per_s: dict[str, float] = {}
+    latencies: dict[str, Latency] = {}
 
 
 class StatusMessage(Message, frozen=True, kw_only=True):
@@ -186,16 +232,30 @@ class EventMessage(Message, frozen=True, kw_only=True):
     text: str
 
 
+class EventsMessage(Message, frozen=True, kw_only=True):
+    """The last events, the newest first; the daemon forgets them when it ends."""
+
+    schema: Literal["vad.events.v1"] = "vad.events.v1"
+    events: tuple[EventMessage, ...] = ()
+
+
 class ErrorMessage(msgspec.Struct, frozen=True, kw_only=True):
-    """Why a query is refused: a code for programs, a sentence for people."""
+    """Why a query is refused: a code for programs, a sentence for people.
+
+    Codes now: bad_selector; out_of_history (asked for a time before what is kept); not_available (this daemon
+    keeps no history); busy (ask again later); internal. A reader takes one it does not know for a refusal.
+    """
 
     schema: Literal["vad.error.v1"] = "vad.error.v1"
-    code: Literal["bad_selector", "internal"]
+    code: str
     text: str
 
 
 ALL: tuple[type[msgspec.Struct], ...] = (
     DeviceMessage,
+    DevicesMessage,
+    HistoryMessage,
+    EventsMessage,
     CameraMessage,
     MapMessage,
     HeatmapMessage,

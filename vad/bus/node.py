@@ -1,9 +1,9 @@
 """The daemon's side of the bus: what was published last, and the answers to who asks for it.
 
-State is a snapshot that the event loop replaces and never changes. zenoh calls back on its own network
-thread, one a link: there a query is answered from the snapshot at hand, and all else goes over to the loop. A
-reader that stops reading holds up its own link only (measured: others are answered as fast as ever, and the
-interpreter lock is free meanwhile).
+State is a snapshot that the event loop replaces and never changes (board.py). zenoh calls back on its own
+network thread, one a link: there a query is answered from the snapshot at hand, and all else goes over to the
+loop. A reader that stops reading holds up its own link only (measured: others are answered as fast as ever,
+and the interpreter lock is free meanwhile).
 """
 
 from __future__ import annotations
@@ -11,60 +11,40 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
+import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
-from datetime import UTC, datetime
 from functools import partial
-from types import MappingProxyType, TracebackType
+from types import TracebackType
 from typing import Self
 
-import msgspec
 import zenoh
 from zenoh import handlers
 
 from vad.bus import messages as m
+from vad.bus.answers import Answerer, Later, NoHistoryError, Past, Reply, answerers
+from vad.bus.board import PNG_ENCODING, Board, Entry, entry_of, raw_entry
 from vad.bus.keys import ANY, HubKeys
-from vad.bus.selectors import SelectorError, parse_device_selector, require_no_selector
+from vad.bus.schemas import SCHEMA_ENCODING, json_schemas
+from vad.bus.selectors import SelectorError
 from vad.bus.session import BusSettings, open_session
 from vad.errors import VadError
 from vad.health import Health
+from vad.wall import now_rfc3339 as now_rfc3339  # where publishers look for it
 
 log = logging.getLogger(__name__)
 
-PNG_ENCODING = "image/png"
 CLOSE_TIMEOUT_S = 0.8
 KEPT_CAPTURES = 32
 """Captures a query still finds; older ones are forgotten."""
+MAX_LATER = 64
+"""Questions about the past that may wait for the store at one time."""
 
 
-@dataclass(frozen=True, slots=True)
-class Entry:
-    """The last value of one key. message: without its times, to compare and select; None for a picture."""
+class BusyError(VadError):
+    """More is asked than can be answered now."""
 
-    key: zenoh.KeyExpr
-    payload: bytes
-    encoding: str
-    message: m.Message | None
-
-
-Wanted = Callable[[Entry], bool]
-Entries = MappingProxyType[str, Entry]
-
-
-def now_rfc3339() -> str:
-    """Wall time, UTC, to the millisecond."""
-    return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-
-
-def _wants_everything(parameters: str) -> Wanted:
-    require_no_selector(parameters)
-    return lambda _entry: True
-
-
-def _wants_devices(parameters: str) -> Wanted:
-    selector = parse_device_selector(parameters)
-    return lambda entry: isinstance(entry.message, m.DeviceMessage) and selector.wants(entry.message)
+    code = "busy"
 
 
 async def _close_in_time(session: zenoh.Session) -> None:
@@ -94,10 +74,11 @@ async def _close_in_time(session: zenoh.Session) -> None:
 class Bus:
     """Publishes on change and answers queries; one per daemon, used on one event loop.
 
-    What is published before `open` is there for the first query after it.
+    What is published before `open` is there for the first query after it. source: what the daemon's home is,
+    for answers that hold several messages or none.
     """
 
-    def __init__(self, settings: BusSettings) -> None:
+    def __init__(self, settings: BusSettings, *, source: m.Source = "live") -> None:
         if settings.hub == ANY:
             raise VadError("a daemon needs a hub name of its own", where="hub")
         self.keys = HubKeys(settings.hub)
@@ -106,29 +87,26 @@ class Bus:
         self._session: zenoh.Session | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._token: zenoh.LivelinessToken | None = None
-        self._tables: dict[str, Entries] = {
-            pattern: MappingProxyType({})
-            for pattern in (
-                self.keys.status,
-                self.keys.map,
-                self.keys.grid,
-                self.keys.camera(),
-                self.keys.device(),
-                self.keys.heatmap(),
-                self.keys.capture(),
+        self._board = Board(self.keys)
+        self._answerers = answerers(self._board, source)
+        self._past: Past | None = None
+        self._later: set[asyncio.Task[None]] = set()
+        for name, text in json_schemas().items():
+            self._board.put(
+                self.keys.schema(), raw_entry(self.keys.schema(name), text.encode(), SCHEMA_ENCODING)
             )
-        }
 
     async def open(self) -> None:
         """Listen, answer, show the liveliness token; VadError where the address cannot be used."""
         self._loop = asyncio.get_running_loop()
         session = await asyncio.to_thread(open_session, self._settings)
         self._session = session
-        for pattern in self._tables:
-            parse = _wants_devices if pattern == self.keys.device() else _wants_everything
+        for pattern, answerer in self._answerers.items():
             # indirect=False: no Python thread of its own, which would keep the process from ending
-            callback = handlers.Callback(partial(self._answer, pattern, parse), indirect=False)
+            callback = handlers.Callback(partial(self._answer, answerer), indirect=False)
             session.declare_queryable(pattern, callback, complete=True)
+        for entry in self._board.tables[self.keys.schema()].values():
+            self._put(entry)
         self._token = session.liveliness().declare_token(self.keys.alive)
         self._listening()
 
@@ -139,6 +117,11 @@ class Bus:
         """Take everything back, in CLOSE_TIMEOUT_S at most; safe to call twice."""
         session, self._session = self._session, None
         self._token = None
+        waiting = set(self._later)
+        for task in waiting:
+            task.cancel()
+        if waiting:
+            await asyncio.wait(waiting)
         if session is not None:
             await _close_in_time(session)
 
@@ -158,6 +141,10 @@ class Bus:
             raise RuntimeError("the bus is not open")
         return self._session
 
+    def ask_past(self, past: Past | None) -> None:
+        """From now on questions about the past (`?at=`, history) go to `past`."""
+        self._past = past
+
     def publish_status(self, message: m.StatusMessage) -> None:
         """Replace the status; a put only where more than the uptime changed."""
         self._publish(self.keys.status, self.keys.status, message)
@@ -168,10 +155,8 @@ class Bus:
 
     def publish_grid(self, png: bytes) -> None:
         """Replace the occupancy grid's picture (see vad.bus.grid)."""
-        old = self._tables[self.keys.grid].get(self.keys.grid)
-        entry = Entry(zenoh.KeyExpr(self.keys.grid), png, PNG_ENCODING, None)
-        self._keep(self.keys.grid, entry)
-        if old is None or old.payload != png:
+        entry = raw_entry(self.keys.grid, png, PNG_ENCODING)
+        if self._board.put(self.keys.grid, entry):
             self._put(entry)
 
     def publish_camera(self, message: m.CameraMessage) -> None:
@@ -190,12 +175,13 @@ class Bus:
         """Replace the progress of one capture; only the last KEPT_CAPTURES stay."""
         pattern = self.keys.capture()
         self._publish(pattern, self.keys.capture(message.session), message)
-        kept = list(self._tables[pattern].items())[-KEPT_CAPTURES:]
-        self._tables[pattern] = MappingProxyType(dict(kept))
+        self._board.keep_last(pattern, KEPT_CAPTURES)
 
     def publish_event(self, message: m.EventMessage) -> None:
-        """Tell subscribers what happened; nobody can ask for it later."""
-        self._put(self._entry(self.keys.events, message))
+        """Tell subscribers what happened; who asks is answered with the last ones."""
+        entry = entry_of(self.keys.events, message, self.keys.hub)
+        self._board.tell(entry)
+        self._put(entry)
 
     def forget_device(self, mac: str) -> None:
         """Remove a device and its heatmap; subscribers see a delete."""
@@ -203,30 +189,13 @@ class Bus:
             (self.keys.device(), self.keys.device(mac)),
             (self.keys.heatmap(), self.keys.heatmap(mac)),
         ):
-            table = self._tables[pattern]
-            if key not in table:
-                continue
-            self._tables[pattern] = MappingProxyType({k: v for k, v in table.items() if k != key})
-            if self._session is not None:
+            if self._board.drop(pattern, key) and self._session is not None:
                 self._guard(partial(self._session.delete, key))
 
-    def _entry(self, key: str, message: m.Message) -> Entry:
-        """What to send; its message lacks what changes by itself, for comparing."""
-        plain = msgspec.structs.replace(message, hub=self.keys.hub, published_at="")
-        sent = msgspec.structs.replace(plain, published_at=now_rfc3339())
-        if isinstance(plain, m.StatusMessage):
-            plain = msgspec.structs.replace(plain, uptime_s=0.0)
-        return Entry(zenoh.KeyExpr(key), m.encode(sent), m.encoding_of(type(message)), plain)
-
     def _publish(self, pattern: str, key: str, message: m.Message) -> None:
-        old = self._tables[pattern].get(key)
-        entry = self._entry(key, message)
-        self._keep(pattern, entry)
-        if old is None or old.message != entry.message:
+        entry = entry_of(key, message, self.keys.hub)
+        if self._board.put(pattern, entry):
             self._put(entry)
-
-    def _keep(self, pattern: str, entry: Entry) -> None:
-        self._tables[pattern] = MappingProxyType({**self._tables[pattern], str(entry.key): entry})
 
     def _put(self, entry: Entry) -> None:
         if self._session is None:
@@ -234,8 +203,8 @@ class Bus:
         put = partial(
             self._session.put,
             entry.key,
-            entry.payload,
-            encoding=entry.encoding,
+            entry.form.payload,
+            encoding=entry.form.encoding,
             congestion_control=zenoh.CongestionControl.DROP,
             express=True,
         )
@@ -252,49 +221,84 @@ class Bus:
             if self.health.state != "ok":
                 self._listening()
 
-    def _count(self, name: str) -> None:
-        """Add one to a counter, from zenoh's thread."""
+    def _to_loop(self, call: Callable[[], object]) -> None:
+        """Have the loop do something, from zenoh's thread."""
         if self._loop is None:
             return
         with suppress(RuntimeError):  # the loop ended before an answer that a stalled reader held up
-            self._loop.call_soon_threadsafe(self._add_one, name)
+            self._loop.call_soon_threadsafe(call)
 
-    def _add_one(self, name: str) -> None:
-        self.health.counters[name] += 1
+    def _note(self, outcome: str, begun_s: float) -> None:
+        """A question is dealt with; called on the loop."""
+        self.health.counters["queries"] += 1
+        if outcome:
+            self.health.counters[outcome] += 1
+        self.health.took("answer", time.perf_counter() - begun_s)
 
-    def _answer(self, pattern: str, parse: Callable[[str], Wanted], query: zenoh.Query) -> None:
-        """Answer one query, on zenoh's thread."""
-        with query:
-            self._count("queries")
-            try:
-                self._reply_all(self._tables[pattern], parse(str(query.parameters)), query)
-            except SelectorError as error:
-                self._count("refused")
-                self._refuse(query, m.ErrorMessage(code="bad_selector", text=str(error)))
-            except zenoh.ZError as error:
-                self._count("replies_lost")
-                log.debug("a reply was lost: %s", error)
-            except (ArithmeticError, LookupError, TypeError, ValueError) as error:
-                self._count("failed")
-                log.exception("a query on %s failed", query.key_expr)
-                text = f"The daemon could not answer ({type(error).__name__}); its log says more"
-                self._refuse(query, m.ErrorMessage(code="internal", text=text))
+    def _answer(self, answerer: Answerer, query: zenoh.Query) -> None:
+        """Answer one query, on zenoh's thread; what needs the store waits on the loop."""
+        begun_s = time.perf_counter()
+        answer: list[Reply] | Later = []
+        outcome = ""
+        try:
+            answer = answerer(str(query.key_expr), str(query.parameters))
+            if isinstance(answer, list):
+                outcome = self._send(query, answer)
+        except SelectorError as error:
+            outcome = self._refuse(query, error)
+        except (ArithmeticError, LookupError, TypeError, ValueError, VadError) as error:
+            log.exception("a query on %s failed", query.key_expr)
+            outcome = self._fail(query, error)
+        if isinstance(answer, Later):
+            self._to_loop(partial(self._begin_later, answer, query, begun_s))
+            return
+        query.drop()  # type: ignore[no-untyped-call]
+        self._to_loop(partial(self._note, outcome, begun_s))
 
-    def _reply_all(self, entries: Entries, wanted: Wanted, query: zenoh.Query) -> None:
-        asked = str(query.key_expr)
-        hit = entries.get(asked)
-        if hit is not None:
-            found = [hit]
-        else:
-            found = [entry for entry in entries.values() if query.key_expr.intersects(entry.key)]
-        for entry in found:
-            if self._session is None:
-                return  # closing: do not wait for readers any more
-            if wanted(entry):
-                query.reply(entry.key, entry.payload, encoding=entry.encoding)
+    def _begin_later(self, answer: Later, query: zenoh.Query, begun_s: float) -> None:
+        task = asyncio.create_task(self._answer_later(answer, query, begun_s), name="bus: the past")
+        self._later.add(task)
+        task.add_done_callback(self._later.discard)
+
+    async def _answer_later(self, answer: Later, query: zenoh.Query, begun_s: float) -> None:
+        """Ask the store, then send in a thread: an asker that does not read must not stop the loop."""
+        outcome = ""
+        try:
+            if self._past is None:
+                raise NoHistoryError("this daemon keeps no history")
+            if len(self._later) > MAX_LATER:
+                raise BusyError("too many questions about the past at once", remedy="Ask again in a second")
+            replies = await answer.ask(self._past)
+            outcome = await asyncio.to_thread(self._send, query, replies)
+        except VadError as error:
+            outcome = await asyncio.to_thread(self._refuse, query, error)
+        finally:
+            query.drop()  # type: ignore[no-untyped-call]
+            self._note(outcome, begun_s)
+
+    def _send(self, query: zenoh.Query, replies: list[Reply]) -> str:
+        """What to count it as."""
+        try:
+            for reply in replies:
+                if self._session is None:
+                    return ""  # closing: do not wait for readers any more
+                query.reply(reply.key, reply.form.payload, encoding=reply.form.encoding)
+        except zenoh.ZError as error:
+            log.debug("a reply was lost: %s", error)
+            return "replies_lost"
+        return ""
+
+    def _refuse(self, query: zenoh.Query, error: VadError) -> str:
+        self._reply_error(query, m.ErrorMessage(code=error.code, text=str(error)))
+        return "refused"
+
+    def _fail(self, query: zenoh.Query, error: Exception) -> str:
+        text = f"The daemon could not answer ({type(error).__name__}); its log says more"
+        self._reply_error(query, m.ErrorMessage(code="internal", text=text))
+        return "failed"
 
     @staticmethod
-    def _refuse(query: zenoh.Query, message: m.ErrorMessage) -> None:
+    def _reply_error(query: zenoh.Query, message: m.ErrorMessage) -> None:
         try:
             query.reply_err(m.encode(message), encoding=m.encoding_of(m.ErrorMessage))
         except zenoh.ZError as error:

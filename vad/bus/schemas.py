@@ -14,9 +14,11 @@ import msgspec
 
 from vad.bus.messages import ALL, schema_id
 
+SCHEMA_ENCODING = "application/schema+json"
+
 
 def json_schemas() -> dict[str, str]:
-    """Schema id -> JSON Schema (2020-12) as indented text with sorted keys."""
+    """Schema id -> JSON Schema (2020-12) as indented text with sorted keys; a hub answers them, too."""
     return {
         schema_id(kind): json.dumps(msgspec.json.schema(kind), indent=2, sort_keys=True) + "\n"
         for kind in ALL
