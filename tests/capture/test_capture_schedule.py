@@ -159,6 +159,8 @@ def test_a_mapped_device_is_looked_at_once_a_day() -> None:
     assert book.decide(24 * H, [mapped], WALKER).provoke == (LAMP,)
     book.measured(24 * H, LAMP)
     assert book.decide(47 * H, [mapped], WALKER).provoke == ()
+    book.look_again(24 * H + S, LAMP)
+    assert book.decide(24 * H + S, [mapped], WALKER).provoke == (), "it comes and goes"
     book.look_again(47 * H, LAMP)
     assert book.decide(47 * H, [mapped], WALKER).provoke == (LAMP,)
     never = Schedule(Limits(recheck_ns=0))
@@ -186,6 +188,19 @@ def test_many_devices_are_measured_alike(count: int, together: int, start: int) 
             walks[mac] += 1
             book.measured(now_ns, mac)
     assert max(walks.values()) - min(walks[mac] for mac in macs) <= 1
+
+
+def test_a_device_whose_walks_tell_nothing_does_not_hold_up_the_others() -> None:
+    book, walks = Schedule(Limits(together=1)), Counter({LAMP: 0, TV: 1})
+    for walk in range(20):
+        (mac,) = book.decide(walk * H, [device(LAMP), device(TV, walks=walks[TV])], WALKER).record
+        walks[mac] += 1
+        if mac == LAMP:
+            book.failed(walk * H, LAMP, "the walker left", its_fault=False)
+        else:
+            book.measured(walk * H, TV)
+        assert walk > 2 or mac == LAMP, "new goes first"
+    assert abs(walks[LAMP] - walks[TV]) <= 2
 
 
 @given(

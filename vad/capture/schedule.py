@@ -20,6 +20,8 @@ RETRY_FIRST_NS = 60 * 1_000_000_000
 RETRY_LAST_NS = 6 * 3600 * 1_000_000_000
 RETRY_BLURRED_NS = 3600 * 1_000_000_000
 """First pause of a device that many walks did not make sharp; it doubles, too."""
+FRUITLESS = 3
+"""After so many walks in a row that told nothing of it, a device goes before others no more."""
 FREE_CHECK_NS = 3600 * 1_000_000_000
 """A mapped device that sends by itself is taken along this often: it costs no airtime."""
 
@@ -96,6 +98,8 @@ class _Book:
 
     since_ns: int
     measured_ns: int | None = None
+    tried_ns: int = 0
+    fruitless: int = 0
     not_before_ns: int = 0
     pause_ns: int = 0
     failure: str = ""
@@ -134,23 +138,29 @@ class Schedule:
     def measured(self, now_ns: int, mac: str, *, blurred: bool = False) -> None:
         """A walk told something of the device; blurred: so many walks did not make it sharp."""
         book = self._book(now_ns, mac)
-        book.measured_ns, book.look_again, book.failure = now_ns, False, ""
+        book.measured_ns = book.tried_ns = now_ns
+        book.fruitless, book.look_again, book.failure = 0, False, ""
         book.pause_ns = min(max(2 * book.pause_ns, RETRY_BLURRED_NS), 4 * RETRY_LAST_NS) if blurred else 0
         book.not_before_ns = now_ns + book.pause_ns
 
     def failed(self, now_ns: int, mac: str, reason: str, *, its_fault: bool) -> None:
         """A walk told nothing of the device; after its own faults the pause before the next try grows."""
         book = self._book(now_ns, mac)
-        book.failure = reason
-        if its_fault:
+        book.failure, book.tried_ns = reason, now_ns
+        if not its_fault:
+            book.fruitless += 1
+        else:
             book.pause_ns = min(max(2 * book.pause_ns, RETRY_FIRST_NS), RETRY_LAST_NS)
             book.not_before_ns = now_ns + book.pause_ns
             book.failure = f"{reason}; the next try comes {_duration(book.pause_ns)} later"
 
     def look_again(self, now_ns: int, mac: str) -> None:
-        """The device joined anew (it may have been carried elsewhere): it is due, without a pause."""
+        """The device joined anew: it is due without a pause, for it may have been carried elsewhere.
+
+        Some devices come and go all day: one that was measured within FREE_CHECK_NS is not looked at again.
+        """
         book = self._book(now_ns, mac)
-        book.look_again = True
+        book.look_again = book.measured_ns is None or now_ns - book.measured_ns > FREE_CHECK_NS
         book.pause_ns = book.not_before_ns = 0
 
     def _decide(self, now_ns: int, devices: Sequence[Candidate], view: View, *, airtime: bool) -> Decision:
@@ -253,10 +263,14 @@ class Schedule:
         return f"{failure}; {device.wish}" if failure else device.wish
 
     def _order(self, now_ns: int, device: Candidate) -> tuple[int, int, int, int]:
+        """The smaller goes first. A walk that told nothing counts as one: nobody holds up the others."""
         book = self._book(now_ns, device.mac)
         kind = self.kind(now_ns, device)
         walks = 0 if kind == "check" else device.walks
-        return _RANK[kind], walks, book.measured_ns or 0, book.since_ns
+        rank = _RANK[kind]
+        if book.fruitless >= FRUITLESS:
+            rank = max(rank, _RANK["sharpen"])
+        return rank, walks + book.fruitless, book.tried_ns, book.since_ns
 
     def _check_due(self, now_ns: int, device: Candidate) -> bool:
         if self._book(now_ns, device.mac).look_again:
