@@ -166,10 +166,13 @@ class MapSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
 
 class BusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """zenoh. listen: loopback only unless TLS is set up; connect: other routers."""
+    """zenoh. listen: tcp on the loopback interface and, for the network, tls (e.g. tls/0.0.0.0:7448) for who
+    has a certificate of `vad pki`; connect: other routers; pki: the folder of certificates, left out: `pki`
+    in state_dir."""
 
     listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
     connect: tuple[str, ...] = ()
+    pki: str | None = None
 
 
 class CaptureSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -278,6 +281,13 @@ def load_settings(path: Path) -> Settings:
     except UnicodeDecodeError as error:
         raise ConfigError("not UTF-8 text", where=str(path)) from error
     return parse_settings(text, where=str(path))
+
+
+def pki_folder(settings: Settings, config_file: Path) -> Path:
+    """The folder of certificates (vad.pki.folder)."""
+    if settings.bus.pki is not None:
+        return resolve(settings.bus.pki, config_file)
+    return resolve(settings.state_dir, config_file) / "pki"
 
 
 def resolve(path: str, config_file: Path) -> Path:

@@ -103,24 +103,36 @@ def test_a_daemon_needs_a_name(endpoint: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "good", ["tcp/127.0.0.1:7447", "tcp/localhost:1", "tcp/[::1]:7447", "tcp/127.9.9.9:7447"]
+    "good",
+    [
+        "tcp/127.0.0.1:7447",
+        "tcp/localhost:1",
+        "tcp/[::1]:7447",
+        "tcp/127.9.9.9:7447",
+        "tls/0.0.0.0:7448",
+        "tls/[::]:7448",
+        "tls/hub.local:7448",
+    ],
 )
-def test_loopback_is_accepted(good: str) -> None:
+def test_loopback_is_accepted_and_tls_anywhere(good: str) -> None:
     check_endpoint(good)
 
 
 @pytest.mark.parametrize(
     ("bad", "reason"),
     [
-        ("tcp/0.0.0.0:7447", "TLS"),
-        ("tcp/192.168.1.5:7447", "TLS"),
-        ("tcp/[::]:7447", "TLS"),
-        ("tcp/hub.local:7447", "TLS"),
+        ("tcp/0.0.0.0:7447", "vad pki init"),
+        ("tcp/192.168.1.5:7447", "vad pki init"),
+        ("tcp/[::]:7447", "vad pki init"),
+        ("tcp/hub.local:7447", "vad pki init"),
         ("udp/127.0.0.1:7447", "not supported"),
         ("ws/127.0.0.1:7447", "not supported"),
         ("tcp/127.0.0.1", "not an endpoint"),
         ("tcp/127.0.0.1:99999", "not an endpoint"),
         ("127.0.0.1:7447", "not an endpoint"),
+        ("tcp/127.0.0.1:7447, tls/0.0.0.0:7448", "not an endpoint"),
+        ("tcp/127.0.0.1:7447#iface=eth0", "not an endpoint"),
+        ("tls/0.0.0.0:7448;prio=1", "not an endpoint"),
         ("", "not an endpoint"),
     ],
 )

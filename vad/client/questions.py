@@ -15,6 +15,7 @@ from vad.bus import messages as m
 from vad.bus.grid import npy_to_heatmap
 from vad.bus.keys import HubKeys, parse_key
 from vad.bus.selectors import Bbox, DeviceQuestion, HistoryQuestion, device_selector, time_of
+from vad.bus.session import is_tls
 from vad.errors import ProtocolError, VadError
 
 QUERY_TIMEOUT_S = 5.0
@@ -212,10 +213,13 @@ def refusal(payload: bytes, endpoint: str, timeout_s: float) -> VadError:
 def unreachable(endpoint: str, hub: str) -> UnreachableError:
     """Nobody is there."""
     which = "" if hub == "*" else f" as hub {hub!r}"
-    return UnreachableError(
-        f"no vad daemon answers at {endpoint}{which}",
-        remedy="Start it (`vad run`, or `systemctl start vad`), or name its address with --endpoint",
-    )
+    remedy = "Start it (`vad run`, or `systemctl start vad`), or name its address with --endpoint"
+    if is_tls(endpoint):
+        remedy = (
+            "It may not run, or not let this certificate in, or not let it see the map: on the hub, "
+            "`vad status` and `vad pki list` tell"
+        )
+    return UnreachableError(f"no vad daemon answers at {endpoint}{which}", remedy=remedy)
 
 
 def hub_names(keys: Iterable[str]) -> list[str]:

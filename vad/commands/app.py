@@ -11,6 +11,7 @@ from vad.commands.demo import demo
 from vad.commands.devices import devices
 from vad.commands.doctor import doctor
 from vad.commands.map import map_app
+from vad.commands.pki import app as pki_app
 from vad.commands.replay import replay
 from vad.commands.robot import app as robot_app
 from vad.commands.run import check_config, run
@@ -52,3 +53,4 @@ app.command()(sim)
 app.command()(doctor)
 app.add_typer(csi_app, name="csi")
 app.add_typer(robot_app, name="robot")
+app.add_typer(pki_app, name="pki")

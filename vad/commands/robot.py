@@ -90,7 +90,7 @@ async def running_robot(
     settings: Settings, out_queue: DropOldestQueue[RobotPose]
 ) -> AsyncIterator[PoseSource]:
     """The settings' robot, running; a zenoh session of its own where the robot needs one."""
-    from vad.bus.session import BusSettings, open_session  # zenoh takes a while to import
+    from vad.bus.session import BusSettings, local_endpoints, open_session  # zenoh takes a while to import
     from vad.daemon.adapters import robot_source
     from vad.errors import VadError
 
@@ -99,11 +99,12 @@ async def running_robot(
     )
     # What is wrong is shown; without a handler Python would print it, too.
     logging.getLogger("vad").addHandler(logging.NullHandler())
+    local = local_endpoints(settings.bus.listen)
     try:
         # A running daemon is the router; without one we are, so that the robot finds one.
-        session = open_session(BusSettings(mode="client", connect=settings.bus.listen))
+        session = open_session(BusSettings(mode="client", connect=local))
     except VadError:
-        listen = settings.bus.listen if needs_router else ()
+        listen = local if needs_router else ()
         session = open_session(BusSettings(mode="router", listen=listen, connect=settings.bus.connect))
     try:
         robot = robot_source(settings, session)

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import zenoh
 
+from vad.bus.gate import Gate, GateSettings
+from vad.bus.session import local_endpoints, tls_endpoints
 from vad.camera.folder import FolderCamera, Recording
 from vad.camera.frame import CameraSource
 from vad.camera.http_stream import HttpStreamCamera
@@ -23,6 +25,7 @@ from vad.config import (
     Ros2Robot,
     Settings,
     ValetudoRobot,
+    pki_folder,
 )
 from vad.csi.attribution import Attribution
 from vad.csi.connector import Connector
@@ -32,6 +35,7 @@ from vad.devices.hostapd_source import HostapdSource
 from vad.devices.static_list import StaticList
 from vad.devices.station import JoinSource
 from vad.mac import mac_from_text
+from vad.pki.folder import PkiFolder
 from vad.robot.json_line_source import JsonLineSource
 from vad.robot.neato_source import NeatoSource
 from vad.robot.pose import PoseSource
@@ -41,6 +45,15 @@ from vad.robot.ros2_keys import Style
 from vad.robot.ros2_source import Ros2Source, Ros2Topics
 from vad.robot.valetudo_source import ValetudoSource
 from vad.robot.zenoh_source import ZenohPoseSource
+
+
+def network_gate(settings: Settings, config_file: Path) -> Gate | None:
+    """The way in from the network, where the settings listen there."""
+    listen = tls_endpoints(settings.bus.listen)
+    if not listen:
+        return None
+    daemon = local_endpoints(settings.bus.listen)[0]
+    return Gate(GateSettings(settings.hub, listen, daemon), PkiFolder(pki_folder(settings, config_file)))
 
 
 def robot_source(settings: Settings, session: zenoh.Session) -> PoseSource:

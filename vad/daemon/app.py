@@ -16,11 +16,13 @@ from vad.bus import messages as m
 from vad.bus.grid import grid_to_png
 from vad.bus.node import Bus, now_rfc3339
 from vad.bus.session import BusSettings as NodeSettings
+from vad.bus.session import local_endpoints
 from vad.camera.frame import Frame
 from vad.config import Settings, resolve
 from vad.csi.packets import CsiBatch
-from vad.daemon.adapters import camera_source, csi_source, join_sources, robot_source
+from vad.daemon.adapters import camera_source, csi_source, join_sources, network_gate, robot_source
 from vad.daemon.captures import Captures
+from vad.daemon.checks import check_listen
 from vad.daemon.ears import Ears
 from vad.daemon.eyes import Eyes
 from vad.daemon.floor import Change, FloorKeeper, first_plan, follow_plans
@@ -46,6 +48,7 @@ STATUS_EVERY_S = 0.5
 
 async def run_daemon(settings: Settings, config_file: Path) -> None:
     """Run until cancelled; VadError where something without which nothing works is missing or breaks."""
+    check_listen(settings, config_file)
     plan = None
     if settings.map.file is not None:
         plan = await asyncio.to_thread(
@@ -55,7 +58,8 @@ async def run_daemon(settings: Settings, config_file: Path) -> None:
     network = await asyncio.to_thread(PoseNetwork, model, threads=settings.vision.threads)
     state_dir = resolve(settings.state_dir, config_file)
     store = StoreWorker(state_dir / "vad.sqlite")
-    bus = Bus(NodeSettings(hub=settings.hub, listen=settings.bus.listen, connect=settings.bus.connect))
+    listen = local_endpoints(settings.bus.listen)
+    bus = Bus(NodeSettings(hub=settings.hub, listen=listen, connect=settings.bus.connect))
     await store.open()
     try:
         await bus.open()
@@ -89,6 +93,7 @@ class Daemon:
         self._network = network
         self._bus = bus
         self._store = store
+        self._gate = network_gate(settings, config_file)
         self._started = time.monotonic()
         self._calibrations: DropOldestQueue[CameraCalibration] = DropOldestQueue(1)
 
@@ -108,6 +113,8 @@ class Daemon:
 
     async def _start(self, group: asyncio.TaskGroup) -> None:
         settings = self._settings
+        if self._gate is not None:
+            group.create_task(self._gate.run(), name="gate")
         robot = robot_source(settings, self._bus.session)
         camera = camera_source(settings.camera, self._base)
         csi = csi_source(settings.radio, self._base)
@@ -158,6 +165,7 @@ class Daemon:
             csi.health,
             captures.traffic.health,
             self._bus.health,
+            *([self._gate.health] if self._gate is not None else []),
         ]
         queues: dict[str, DropOldestQueue[Any]] = {"poses": poses, "frames": frames, "csi": batches}
         group.create_task(

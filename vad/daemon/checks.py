@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from vad.bus.session import check_endpoint
-from vad.config import Settings, resolve
+from vad.bus.session import check_endpoint, local_endpoints, tls_endpoints
+from vad.config import Settings, pki_folder, resolve
 from vad.daemon.adapters import camera_source
 from vad.errors import ConfigError
+from vad.pki.folder import PkiFolder
 from vad.robot.map_server import load_floor_plan, load_rooms
 
 
@@ -20,5 +21,23 @@ def check_files(settings: Settings, config_file: Path) -> None:
     if settings.vision.model and not resolve(settings.vision.model, config_file).is_file():
         raise ConfigError("no such file", where=f"{config_file}: $.vision.model")
     camera_source(settings.camera, config_file.parent)
+    check_bus(settings, config_file)
+
+
+def check_bus(settings: Settings, config_file: Path) -> None:
+    """VadError where the bus cannot listen as the settings say."""
     for endpoint in settings.bus.listen:
         check_endpoint(endpoint)
+    check_listen(settings, config_file)
+    if tls_endpoints(settings.bus.listen):
+        PkiFolder(pki_folder(settings, config_file)).hub_files()
+
+
+def check_listen(settings: Settings, config_file: Path) -> None:
+    """ConfigError where nothing listens on the hub itself: its commands and the gate go through that."""
+    if not local_endpoints(settings.bus.listen):
+        raise ConfigError(
+            "there is no endpoint for the hub itself",
+            where=f"{config_file}: $.bus.listen",
+            remedy="Add tcp/127.0.0.1:7447",
+        )
