@@ -22,13 +22,13 @@ CameraStatus = Literal["uncalibrated", "collecting", "valid", "invalid"]
 
 SCHEMA = "vad.camera/1"
 # The order of the parameters in every covariance: a small rotation in the camera frame (rad), the camera's
-# position in the map (m), the logarithm of the focal length, k1.
-PARAMETERS = 8
-_STEPS = np.array([1e-5, 1e-5, 1e-5, 1e-4, 1e-4, 1e-4, 1e-5, 1e-5])
+# position in the map (m), the logarithm of the focal length, k1, k2, the principal point (px).
+PARAMETERS = 11
+_STEPS = np.array([1e-5, 1e-5, 1e-5, 1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5, 1e-2, 1e-2])
 
 
 def moved(intrinsics: Intrinsics, camera_from_map: Rigid, change: FloatArray) -> tuple[Intrinsics, Rigid]:
-    """The camera after a small `change` (8,) of its parameters."""
+    """The camera after a small `change` (11,) of its parameters."""
     rotation = rotation_from_vector(change[:3]) @ camera_from_map.rotation
     position = -camera_from_map.rotation.T @ camera_from_map.translation + change[3:6]
     scale = float(np.exp(change[6]))
@@ -36,7 +36,10 @@ def moved(intrinsics: Intrinsics, camera_from_map: Rigid, change: FloatArray) ->
         intrinsics,
         fx_px=intrinsics.fx_px * scale,
         fy_px=intrinsics.fy_px * scale,
+        cx_px=intrinsics.cx_px + float(change[9]),
+        cy_px=intrinsics.cy_px + float(change[10]),
         k1=intrinsics.k1 + float(change[7]),
+        k2=intrinsics.k2 + float(change[8]),
     )
     return lens, Rigid(rotation, -rotation @ position)
 
@@ -52,7 +55,7 @@ class CameraCalibration:
     the robot's pose from the camera's floor point, each pair predicted without itself. homography_gap_m:
     mean distance on the floor between this estimate and a free homography of the same pairs; a large one
     says that the lens is not as described. time_offset_s: pose stamp minus frame stamp of the same moment.
-    parameter_covariance: (8, 8), see PARAMETERS.
+    parameter_covariance: (11, 11), see PARAMETERS.
     """
 
     status: CameraStatus

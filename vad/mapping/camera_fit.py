@@ -10,19 +10,23 @@ from numpy.typing import NDArray
 
 from vad.geometry import FloatArray, Intrinsics, Rigid, project, rotation_from_vector
 from vad.mapping.camera_calibration import PARAMETERS, moved
-from vad.mapping.camera_track import PoseTrack, Sightings
+from vad.mapping.camera_consensus import Sightings
+from vad.mapping.camera_track import PoseTrack
 
 # What is assumed of a lens nobody described: a horizontal view of 40 to 100 degrees, little distortion.
 _FOCAL_PER_WIDTH = np.geomspace(0.4, 2.2, 12)
 _FOCAL_PRIOR_PER_WIDTH = 0.85
 _LOG_FOCAL_PRIOR_SIGMA = 0.5
-_K1_PRIOR_SIGMA = 0.1
+_K1_PRIOR_SIGMA = 0.15
+_K2_PRIOR_SIGMA = 0.05
+_CENTRE_PRIOR_PER_WIDTH = 0.01
 _OFFSET_PRIOR_SIGMA_S = 1.0
 
 # Parameters of the fit: the camera's (camera_calibration.PARAMETERS), then the time offset.
 OFFSET = PARAMETERS
-_FIT_STEPS = np.array([1e-5, 1e-5, 1e-5, 1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 0.25])
+_FIT_STEPS = np.array([1e-5, 1e-5, 1e-5, 1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5, 1e-2, 1e-2, 0.1])
 _HUBER = 2.0
+_UNKNOWN_COSTS = 4.0
 _MAX_ROUNDS = 25
 
 
@@ -35,14 +39,14 @@ class Start:
     time_offset_s: float
 
     def moved(self, change: FloatArray) -> Start:
-        """After a small change (9,) of the fit's parameters."""
+        """After a small change (12,) of the fit's parameters."""
         lens, camera_from_map = moved(self.intrinsics, self.camera_from_map, change[:PARAMETERS])
         return Start(lens, camera_from_map, self.time_offset_s + float(change[OFFSET]))
 
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """The least-squares estimate. covariance: (9, 9); left_out_px: (N, 2) residuals of each pair when it is
+    """The least-squares estimate. covariance: (12, 12); left_out_px: (N, 2) residuals of each pair when it is
     predicted without itself."""
 
     at: Start
@@ -121,7 +125,7 @@ def refine(start: Start, sightings: Sightings, track: PoseTrack, *, free: NDArra
     """Levenberg-Marquardt over pose, lens and time offset, Huber-weighted; every sighting is the robot.
 
     Args:
-        free: (9,) which parameters may change. The priors are those of an undescribed lens.
+        free: (12,) which parameters may change. The priors are those of an undescribed lens.
 
     Returns:
         None if the sightings cannot be predicted or the equations are singular.
@@ -154,6 +158,27 @@ def refine(start: Start, sightings: Sightings, track: PoseTrack, *, free: NDArra
     jacobian = _jacobian(at, sightings, track, whiten)
     normal, _ = _normal_equations(jacobian, error, at, free)
     return _conclude(at, sightings, track, whiten, jacobian, error, normal, free)
+
+
+def information(at: Start, sightings: Sightings, track: PoseTrack, *, lens_known: bool) -> FloatArray:
+    """Fisher information of the parameters that may change, priors included; square.
+
+    Of a true camera and a noiseless track its inverse is the Cramér-Rao bound. The first six rows are the
+    pose.
+    """
+    _, covariance = predict(at, sightings, track)
+    whiten = np.linalg.inv(np.linalg.cholesky(covariance))
+    jacobian = _jacobian(at, sightings, track, whiten)
+    nothing = np.zeros((len(jacobian), 2))
+    normal, _ = _normal_equations(jacobian, nothing, at, free_parameters(lens_known=lens_known))
+    return normal
+
+
+def free_parameters(*, lens_known: bool) -> NDArray[np.bool_]:
+    """Which of the fit's parameters may change, (12,)."""
+    free = np.ones(PARAMETERS + 1, dtype=np.bool_)
+    free[6:PARAMETERS] = not lens_known
+    return free
 
 
 def _conclude(
@@ -190,7 +215,11 @@ def _whitened(at: Start, sightings: Sightings, track: PoseTrack, whiten: FloatAr
     xy, _ = track.at(sightings.t_s + at.time_offset_s)
     predicted = project(np.column_stack([xy, np.zeros(len(xy))]), at.intrinsics, at.camera_from_map)
     difference = (sightings.image_px - predicted)[:, :, None]
-    return np.asarray((whiten @ difference)[:, :, 0], dtype=np.float64)
+    error = np.asarray((whiten @ difference)[:, :, 0], dtype=np.float64)
+    # A moment that the track does not know (any more) costs like a bad outlier and pulls nowhere.
+    unknown = np.array([_UNKNOWN_COSTS, 0.0])
+    known = np.asarray(np.isfinite(error).all(axis=1))
+    return np.where(known[:, None], error, unknown)
 
 
 def _jacobian(at: Start, sightings: Sightings, track: PoseTrack, whiten: FloatArray) -> FloatArray:
@@ -209,20 +238,34 @@ def _weights(error: FloatArray) -> FloatArray:
 
 
 def _prior(at: Start) -> tuple[FloatArray, FloatArray]:
-    """Deviation from the prior in standard deviations (9,), and 1/sigma (9,), zero where there is none."""
-    inverse_sigma = np.zeros(PARAMETERS + 1)
-    inverse_sigma[6:] = 1.0 / _LOG_FOCAL_PRIOR_SIGMA, 1.0 / _K1_PRIOR_SIGMA, 1.0 / _OFFSET_PRIOR_SIGMA_S
-    value = np.zeros(PARAMETERS + 1)
+    """Deviation from the prior in standard deviations (12,), and 1/sigma (12,), zero where there is none."""
     lens = at.intrinsics
+    inverse_sigma = np.zeros(PARAMETERS + 1)
+    value = np.zeros(PARAMETERS + 1)
     value[6] = np.log(lens.fx_px / (_FOCAL_PRIOR_PER_WIDTH * lens.width_px))
-    value[7:] = lens.k1, at.time_offset_s
+    value[7:] = (
+        lens.k1,
+        lens.k2,
+        lens.cx_px - (lens.width_px - 1) / 2,
+        lens.cy_px - (lens.height_px - 1) / 2,
+        at.time_offset_s,
+    )
+    centre_px = _CENTRE_PRIOR_PER_WIDTH * lens.width_px
+    inverse_sigma[6:] = 1.0 / np.array(
+        [
+            _LOG_FOCAL_PRIOR_SIGMA,
+            _K1_PRIOR_SIGMA,
+            _K2_PRIOR_SIGMA,
+            centre_px,
+            centre_px,
+            _OFFSET_PRIOR_SIGMA_S,
+        ]
+    )
     return value * inverse_sigma, inverse_sigma
 
 
 def _cost(error: FloatArray, at: Start) -> float:
     size = np.linalg.norm(error, axis=1)
-    if not np.all(np.isfinite(size)):
-        return float("inf")
     robust = np.where(size <= _HUBER, 0.5 * size**2, _HUBER * (size - 0.5 * _HUBER))
     return float(np.sum(robust) + 0.5 * np.sum(_prior(at)[0] ** 2))
 

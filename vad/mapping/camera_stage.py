@@ -15,15 +15,24 @@ from numpy.typing import ArrayLike, NDArray
 
 from vad.geometry import FloatArray, Intrinsics, apply_homography, floor_homography, undistort
 from vad.mapping.camera_calibration import PARAMETERS, CameraCalibration, CameraStatus
-from vad.mapping.camera_fit import OFFSET, Fit, Start, predict, refine, starting_pose, surprise
-from vad.mapping.camera_track import (
+from vad.mapping.camera_consensus import (
     CONSENSUS_M,
     Consensus,
-    PoseTrack,
     Sightings,
     consensus,
     search_time_offset,
 )
+from vad.mapping.camera_fit import (
+    OFFSET,
+    Fit,
+    Start,
+    free_parameters,
+    predict,
+    refine,
+    starting_pose,
+    surprise,
+)
+from vad.mapping.camera_track import PoseTrack
 
 MIN_PAIRS = 15
 MIN_AREA_M2 = 0.5
@@ -43,6 +52,9 @@ _CELL_M = 0.25
 _ROUNDS = 4
 # A pair this many standard deviations off is something else.
 _MAX_SURPRISE = 4.0
+# A stretch of the drive after the robot found itself anew joins the rest where so many frames agree.
+_JOIN_SHARE = 0.5
+_ENOUGH_SIGHTINGS = 100
 # The pose must be known this long around a pair, for its derivative in time.
 _TIME_MARGIN_S = 0.25
 _MOVING_M_S = 0.05
@@ -104,7 +116,7 @@ class CameraMapper:
         fit = self._fit(sightings, track)
         if fit is None:
             return _no_consensus(frames, 0)
-        return self._judge(*fit, sightings, track)
+        return self._judge(*fit, track)
 
     def _chosen(self, track: PoseTrack, origin_ns: int) -> Sightings:
         """At most SOLVE_FRAMES frames, spread evenly over the floor that was driven."""
@@ -121,18 +133,66 @@ class CameraMapper:
             np.concatenate([empty[:, 0], *(sigma for _, _, sigma in chosen)]),
         )
 
-    def _fit(self, sightings: Sightings, track: PoseTrack) -> tuple[Fit, Sightings] | None:
-        straight = undistort(sightings.image_px, self._lens)
-        few = sightings.frame < _SEARCH_FRAMES
-        found = search_time_offset(straight[few], sightings.take(few), track)
-        found = found and consensus(straight, sightings, track, found.time_offset_s)
-        if found is None or found.frames < 6:
+    def _fit(self, sightings: Sightings, track: PoseTrack) -> tuple[Fit, Sightings, Sightings] | None:
+        """The fit, its pairs, and the sightings it speaks of: those under one belief of the robot."""
+        segment = track.segment_at(sightings.t_s)
+        names, counts = np.unique(segment[segment >= 0], return_counts=True)
+        if len(names) < 2:
+            found = self._fit_one(sightings, track)
+            return None if found is None else (*found, sightings)
+        # The robot has found itself anew in between. What it believed last counts, once that tells enough;
+        # the rest must agree.
+        enough = counts >= min(_ENOUGH_SIGHTINGS, counts.max())
+        for name in names[enough][::-1]:
+            most = name
+            if _spread_gate(*spread(track.at(sightings.t_s[segment == name])[0])) is None:
+                break
+        inside = segment == most
+        found = self._fit_one(sightings.take(inside), track)
+        if found is None:
             return None
+        odd = surprise(found[0].at, sightings, track)
+        for name in names[names != most]:
+            of_it = segment == name
+            agreeing = best_of_each(sightings.frame[of_it], odd[of_it], _MAX_SURPRISE)
+            if len(agreeing) >= _JOIN_SHARE * len(np.unique(sightings.frame[of_it])):
+                inside |= of_it
+        used = sightings.take(inside)
+        if np.count_nonzero(inside) > np.count_nonzero(segment == most):
+            found = self._fit_one(used, track) or found
+        return (*found, used)
+
+    def _fit_one(self, sightings: Sightings, track: PoseTrack) -> tuple[Fit, Sightings] | None:
+        if not len(sightings.frame):
+            return None
+        straight = undistort(sightings.image_px, self._lens)
+        few = sightings.frame < np.unique(sightings.frame)[:_SEARCH_FRAMES][-1]
+        best: tuple[float, Fit, Sightings] | None = None
+        for guess in search_time_offset(straight[few], sightings.take(few), track):
+            found = consensus(straight, sightings, track, guess.time_offset_s)
+            if found is None or found.frames < 6:
+                continue
+            fitted = self._fit_from(found, straight, sightings, track)
+            if fitted is not None:
+                cost = self._misfit(fitted[0].at, sightings, track)
+                if best is None or cost < best[0]:
+                    best = cost, *fitted
+        return None if best is None else best[1:]
+
+    def _misfit(self, at: Start, sightings: Sightings, track: PoseTrack) -> float:
+        """How badly a camera explains all frames: squared surprise of the best of each, cut off."""
+        odd = np.minimum(surprise(at, sightings, track), _MAX_SURPRISE)
+        worst = np.full(int(sightings.frame.max()) + 1, _MAX_SURPRISE)
+        np.minimum.at(worst, sightings.frame, odd)
+        return float(np.sum(worst[np.unique(sightings.frame)] ** 2))
+
+    def _fit_from(
+        self, found: Consensus, straight: FloatArray, sightings: Sightings, track: PoseTrack
+    ) -> tuple[Fit, Sightings] | None:
         start = self._start(found, straight, sightings, track)
         if start is None:
             return None
-        free = np.ones(PARAMETERS + 1, dtype=np.bool_)
-        free[6:PARAMETERS] = not self._lens_known
+        free = free_parameters(lens_known=self._lens_known)
         named = self._agreeing(found, straight, sightings, track)
         result: tuple[Fit, Sightings] | None = None
         for _ in range(_ROUNDS):

@@ -1,59 +1,90 @@
-"""The robot's path between its poses, and the time offset between poses and frames. Pure."""
+"""The robot's path between its poses. Pure."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vad.geometry import FloatArray, apply_homography
+from vad.geometry import FloatArray
+from vad.mapping.camera_beliefs import MAX_GAP_S, beliefs
 
-# Valetudo gives one pose in 2 s (formats.md 4); over a longer gap the robot may have gone anywhere.
-MAX_GAP_S = 2.6
-# No robot vacuum drives faster; a faster step is a relocalisation, nothing between its ends is known.
-MAX_SPEED_M_S = 1.0
 # How far a robot strays from the curve through its poses, as an acceleration.
 _STRAY_M_S2 = 0.1
-_JUMP_SLACK_M = 0.15
-
-CONSENSUS_M = 0.12
-SEARCH_S = 2.0
-_COARSE_STEP_S = 0.2
-_FINE_STEP_S = 0.05
-# RANSAC draws four pairs at a time until four of the robot are likely among them; 0.7 of the frames show it.
-_SHOWN = 0.7
-_MISS_CHANCE = 0.01
-_MIN_ROUNDS, _MAX_ROUNDS = 100, 1000
+# Dense poses are smoothed over this long to each side: a robot turns and stops within it.
+_SMOOTH_S, _SMOOTH_MAX_S = 0.35, 0.6
+_SMOOTH_POSES, _SMOOTH_REACH = 5, 25
 
 
 class PoseTrack:
     """Robot positions as a curve over time: cubic between neighbours, nothing across gaps and jumps.
 
+    Wild poses, which the robot itself takes back with the next ones, are dropped. Where it believes in
+    another place from some moment on it has found itself anew: another segment begins.
+
     Args:
         t_s: (M,) seconds, any origin, any order; doubles are dropped.
         xy_m: (M, 2) map frame. sigma_m: (M,).
+
+    Attributes:
+        wild: how many poses were dropped. segment: (M',) of each pose kept, from 0 on.
     """
 
     def __init__(self, t_s: ArrayLike, xy_m: ArrayLike, sigma_m: ArrayLike) -> None:
         times = np.asarray(t_s, dtype=np.float64)
         _, order = np.unique(times, return_index=True)
-        self.t_s: FloatArray = times[order]
-        self.xy_m: FloatArray = np.asarray(xy_m, dtype=np.float64).reshape(-1, 2)[order]
-        self.sigma_m: FloatArray = np.asarray(sigma_m, dtype=np.float64)[order]
-        steps = np.diff(self.xy_m, axis=0)
+        places = np.asarray(xy_m, dtype=np.float64).reshape(-1, 2)[order]
+        sigmas = np.asarray(sigma_m, dtype=np.float64)[order]
+        kept, segment = beliefs(times[order], places, sigmas)
+        self.wild = len(order) - len(kept)
+        self.segment: NDArray[np.int64] = segment
+        self.t_s: FloatArray = times[order][kept]
+        self.xy_m: FloatArray = places[kept]
+        self.sigma_m: FloatArray = sigmas[kept]
         self._dt = np.diff(self.t_s)
-        velocity = steps / self._dt[:, None]
-        reach = MAX_SPEED_M_S * self._dt + _JUMP_SLACK_M
-        self._usable: NDArray[np.bool_] = (self._dt <= MAX_GAP_S) & (np.linalg.norm(steps, axis=1) <= reach)
+        self._usable: NDArray[np.bool_] = (self._dt <= MAX_GAP_S) & (np.diff(segment) == 0)
+        self._slope: FloatArray = self._mean_slopes()
+        self._smooth()
+
+    def _mean_slopes(self) -> FloatArray:
+        """Velocity at each pose from its neighbours, the nearer counting more."""
+        velocity = np.diff(self.xy_m, axis=0) / self._dt[:, None]
         weight = np.where(self._usable, 1.0 / self._dt, 0.0)
         total = np.zeros(len(self.t_s))
         slopes = np.zeros_like(self.xy_m)
         for side in (slice(1, None), slice(None, -1)):
             total[side] += weight
             slopes[side] += weight[:, None] * np.where(self._usable[:, None], velocity, 0.0)
-        self._slope: FloatArray = slopes / np.maximum(total, 1e-12)[:, None]
+        return np.asarray(slopes / np.maximum(total, 1e-12)[:, None])
+
+    def _smooth(self) -> None:
+        """Where poses are dense, place and velocity from a parabola through the poses around.
+
+        Without it the curve's noise hides from the fit which way the time offset lies. `sigma_m` stays each
+        pose's own: the errors of smoothed neighbours are the same ones.
+        """
+        if len(self.t_s) < _SMOOTH_POSES:
+            return
+        step_s = float(np.median(self._dt))
+        reach_s = max(_SMOOTH_S, 0.55 * (_SMOOTH_POSES - 1) * step_s)
+        if reach_s > _SMOOTH_MAX_S:
+            return
+        count = len(self.t_s)
+        moments = np.zeros((count, 5))
+        sums = np.zeros((count, 3, 2))
+        reach = min(int(np.ceil(reach_s / step_s)), _SMOOTH_REACH)
+        for shift in range(-reach, reach + 1):
+            other = np.arange(count) + shift
+            inside = (other >= 0) & (other < count)
+            other = np.clip(other, 0, count - 1)
+            t = self.t_s[other] - self.t_s
+            inside &= (np.abs(t) <= reach_s) & (self.segment[other] == self.segment)
+            powers = np.where(inside[:, None], t[:, None] ** np.arange(5), 0.0)
+            moments += powers
+            sums += powers[:, :3, None] * self.xy_m[other][:, None, :]
+        enough = moments[:, 0] >= _SMOOTH_POSES
+        normal = moments[enough][:, np.arange(3)[:, None] + np.arange(3)]
+        curve = np.linalg.solve(normal, sums[enough])
+        self.xy_m[enough], self._slope[enough] = curve[:, 0], curve[:, 1]
 
     def at(self, t_s: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Position (N, 2) and sigma (N,) at (N,) times; NaN where the track does not say."""
@@ -77,82 +108,8 @@ class PoseTrack:
         """Index of the pair of poses each (N,) time lies between; times that share one share its noise."""
         return np.asarray(np.searchsorted(self.t_s, t_s, side="right"), dtype=np.int64)
 
-
-@dataclass(frozen=True, slots=True)
-class Sightings:
-    """What the camera offers: K candidates of all frames together.
-
-    frame: (K,) index of the frame; t_s: (K,) its time from the track's origin; image_px: (K, 2) raw;
-    sigma_px: (K,).
-    """
-
-    frame: NDArray[np.int64]
-    t_s: FloatArray
-    image_px: FloatArray
-    sigma_px: FloatArray
-
-    def take(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Sightings:
-        """The chosen candidates."""
-        return Sightings(self.frame[rows], self.t_s[rows], self.image_px[rows], self.sigma_px[rows])
-
-
-@dataclass(frozen=True, slots=True)
-class Consensus:
-    """The plane homography most sightings agree with at one time offset (pose stamp minus frame stamp).
-
-    frames: how many agree; support: the same, each weighted by how well it agrees (MSAC), for a count alone
-    is flat within +-0.3 s at the speed of a robot.
-    """
-
-    time_offset_s: float
-    map_from_image: FloatArray
-    frames: int
-    support: float
-
-
-def consensus(
-    points_px: FloatArray, sightings: Sightings, track: PoseTrack, offset_s: float
-) -> Consensus | None:
-    """Consensus at one time offset, by RANSAC in the map (formats.md 11, the paper's eq. 4).
-
-    Args:
-        points_px: (K, 2) the sightings' pixels with known distortion removed.
-    """
-    xy, _ = track.at(sightings.t_s + offset_s)
-    known = np.isfinite(xy[:, 0]) & np.isfinite(points_px[:, 0])
-    if np.count_nonzero(known) < 8:
-        return None
-    per_frame = len(sightings.frame) / len(np.unique(sightings.frame))
-    good_draw = (_SHOWN / per_frame) ** 4
-    rounds = int(np.clip(np.log(_MISS_CHANCE) / np.log1p(-good_draw), _MIN_ROUNDS, _MAX_ROUNDS))
-    found, _ = cv2.findHomography(
-        points_px[known], xy[known], cv2.RANSAC, CONSENSUS_M, maxIters=rounds, confidence=0.999
-    )
-    if found is None or not np.all(np.isfinite(found)):
-        return None
-    homography = np.asarray(found, dtype=np.float64)
-    miss = np.linalg.norm(apply_homography(homography, points_px) - xy, axis=1)
-    score = np.zeros(int(sightings.frame.max()) + 1)
-    close = np.where(miss < CONSENSUS_M, 1.0 - (miss / CONSENSUS_M) ** 2, 0.0)
-    np.maximum.at(score, sightings.frame, close)
-    return Consensus(offset_s, homography, int(np.count_nonzero(score)), float(np.sum(score)))
-
-
-def search_time_offset(points_px: FloatArray, sightings: Sightings, track: PoseTrack) -> Consensus | None:
-    """The offset within +-2 s with the best supported consensus, coarse to fine; None without any."""
-    half = round(SEARCH_S / _COARSE_STEP_S)
-    # From zero outwards, so that of equals the smaller offset wins.
-    coarse = sorted(range(-half, half + 1), key=abs)
-    best = _best(points_px, sightings, track, [k * _COARSE_STEP_S for k in coarse])
-    if best is None:
-        return None
-    reach = round(_COARSE_STEP_S / _FINE_STEP_S)
-    fine = [best.time_offset_s + k * _FINE_STEP_S for k in range(-reach, reach + 1)]
-    return _best(points_px, sightings, track, fine) or best
-
-
-def _best(
-    points_px: FloatArray, sightings: Sightings, track: PoseTrack, offsets_s: list[float]
-) -> Consensus | None:
-    found = [c for o in offsets_s if (c := consensus(points_px, sightings, track, o)) is not None]
-    return max(found, key=lambda c: c.support, default=None)
+    def segment_at(self, t_s: FloatArray) -> NDArray[np.int64]:
+        """The segment each (N,) time lies in, -1 where the track does not say."""
+        i = np.clip(np.searchsorted(self.t_s, t_s, side="right") - 1, 0, max(len(self.t_s) - 1, 0))
+        known = np.isfinite(self.at(t_s)[0][:, 0])
+        return np.asarray(np.where(known, self.segment[i], -1), dtype=np.int64)
