@@ -78,12 +78,32 @@ class ZenohRobot(msgspec.Struct, tag="zenoh-json", frozen=True, forbid_unknown_f
 
 
 class V4l2CameraSettings(msgspec.Struct, tag="v4l2", frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A USB or built-in camera. device: /dev/video0 or a /dev/v4l/by-id path."""
+    """A USB or built-in camera. device: /dev/video0 or a /dev/v4l/by-id path; format: of the pixels, where
+    the camera has both."""
 
     device: str
     width_px: int = 640
     height_px: int = 480
     fps: Positive = 15.0
+    format: Literal["MJPG", "YUYV"] = "MJPG"
+
+
+class Kinect2CameraSettings(
+    msgspec.Struct, tag="kinect2", frozen=True, forbid_unknown_fields=True, kw_only=True
+):
+    """The colour camera of a Kinect v2 on USB 3. serial: which, where there are several; fraction: pictures
+    of 1920x1080 divided by 1, 2 or 4; fps: pictures decoded, of the 30 that come."""
+
+    serial: str | None = None
+    fraction: Literal[1, 2, 4] = 2
+    fps: Positive = 15.0
+
+
+class RtspCameraSettings(msgspec.Struct, tag="rtsp", frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """An IP camera. url: rtsp://[user:password@]host[:port]/path, best of its small stream."""
+
+    url: str
+    transport: Literal["tcp", "udp"] = "tcp"
 
 
 class MjpegCameraSettings(msgspec.Struct, tag="mjpeg", frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -100,10 +120,19 @@ class FolderCameraSettings(
     path: str
 
 
+CameraSourceSettings = (
+    V4l2CameraSettings
+    | MjpegCameraSettings
+    | RtspCameraSettings
+    | Kinect2CameraSettings
+    | FolderCameraSettings
+)
+
+
 class CameraSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The camera. id: its name on the bus; focal_px: known focal length, else it is estimated."""
 
-    source: V4l2CameraSettings | MjpegCameraSettings | FolderCameraSettings
+    source: CameraSourceSettings
     id: Id = "main"
     focal_px: Positive | None = None
 

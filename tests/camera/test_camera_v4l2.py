@@ -50,6 +50,8 @@ class Handle:
         return good, np.full((48, 64, 3), 9, np.uint8) if good else None
 
     def get(self, prop: int, /) -> float:
+        if prop == cv2.CAP_PROP_FOURCC:
+            return float(cv2.VideoWriter.fourcc(*"YUYV"))
         assert prop == cv2.CAP_PROP_POS_MSEC
         return self.device.stamp_ms()
 
@@ -79,7 +81,7 @@ async def test_driver_stamps_unplug_and_replug() -> None:
     await until(lambda: len(out) >= 3)
     frame = out.drain()[-1]
     assert 25_000_000 < time.monotonic_ns() - frame.t_ns < 2_000_000_000
-    assert camera.health.detail == "64x48, stamps: driver"
+    assert camera.health.detail == "64x48 YUYV, stamps: driver"
     assert device.settings[0] == (cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG"))
     assert (cv2.CAP_PROP_FRAME_WIDTH, 64) in device.settings
     device.plugged.clear()

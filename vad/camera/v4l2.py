@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
-import logging
 import os
 import threading
 import time
@@ -18,14 +15,11 @@ import numpy as np
 
 from vad.camera.frame import Frame
 from vad.camera.stamps import is_plausible
+from vad.camera.threaded import Emit, Shot, run_reopening
 from vad.errors import SourceError
 from vad.health import Health
 from vad.streams import DropOldestQueue
 
-log = logging.getLogger(__name__)
-
-BACKOFF_FIRST_S = 0.5
-BACKOFF_MAX_S = 5.0
 # The thread ends within one frame or this; OpenCV's own 10 s would hold up the end of the daemon.
 _SELECT_TIMEOUT_S = 1
 _SELECT_TIMEOUT_VARIABLE = "OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT"
@@ -76,66 +70,13 @@ class V4l2Camera:
         self.health = Health(part)
         self._settings = settings
         self._opener = opener or open_v4l2
-        self._seq = 0
 
     async def run(self, out: DropOldestQueue[Frame]) -> None:
         """Emit frames into `out` until cancelled."""
-        loop = asyncio.get_running_loop()
-        stop = threading.Event()
-        ended = asyncio.Event()
+        name = f"v4l2 {self._settings.device}"
+        await run_reopening(self._capture, out, self.health, name=name, end_s=_SELECT_TIMEOUT_S)
 
-        def work() -> None:
-            # A RuntimeError: the loop has gone, and nobody waits any more.
-            with contextlib.suppress(RuntimeError):
-                try:
-                    self._work(loop, stop, out)
-                finally:
-                    loop.call_soon_threadsafe(ended.set)
-
-        thread = threading.Thread(target=work, name=f"v4l2 {self._settings.device}", daemon=True)
-        thread.start()
-        try:
-            await ended.wait()
-        finally:
-            stop.set()
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(_SELECT_TIMEOUT_S):
-                    await ended.wait()
-                thread.join(timeout=_SELECT_TIMEOUT_S)
-
-    def _work(
-        self, loop: asyncio.AbstractEventLoop, stop: threading.Event, out: DropOldestQueue[Frame]
-    ) -> None:
-        def emit(frame: Frame, detail: str, driver_stamp: bool) -> None:
-            out.put(frame)
-            self.health.counters["frames"] += 1
-            self.health.counters["arrival_stamps"] += not driver_stamp
-            self.health.ok(detail)
-
-        backoff_s = BACKOFF_FIRST_S
-        while not stop.is_set():
-            seq_before = self._seq
-            try:
-                self._capture(loop, stop, emit)
-            except (SourceError, cv2.error) as error:
-                if not stop.is_set():
-                    loop.call_soon_threadsafe(self._trouble, str(error))
-            if self._seq > seq_before:
-                backoff_s = BACKOFF_FIRST_S
-            stop.wait(backoff_s)
-            backoff_s = min(2.0 * backoff_s, BACKOFF_MAX_S)
-
-    def _trouble(self, reason: str) -> None:
-        level = logging.WARNING if self.health.trouble(reason) else logging.DEBUG
-        log.log(level, "%s: %s", self.health.part, reason)
-        self.health.counters["reopens"] += 1
-
-    def _capture(
-        self,
-        loop: asyncio.AbstractEventLoop,
-        stop: threading.Event,
-        emit: Callable[[Frame, str, bool], None],
-    ) -> None:
+    def _capture(self, stop: threading.Event, emit: Emit) -> None:
         """Read frames until told to stop; a SourceError when the device is not there or has gone."""
         wanted = self._settings
         capture = self._opener(wanted.device)
@@ -148,6 +89,7 @@ class V4l2Camera:
             capture.set(cv2.CAP_PROP_FRAME_WIDTH, wanted.width_px)
             capture.set(cv2.CAP_PROP_FRAME_HEIGHT, wanted.height_px)
             capture.set(cv2.CAP_PROP_FPS, wanted.fps)
+            fourcc = _format(capture)
             while not stop.is_set():
                 good, image = capture.read()
                 arrival_ns = time.monotonic_ns()
@@ -156,13 +98,18 @@ class V4l2Camera:
                 driver_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
                 trusted = driver_ns > 0 and is_plausible(driver_ns, arrival_ns)
                 t_ns = min(driver_ns, arrival_ns) if trusted else arrival_ns
-                frame = Frame(t_ns, self._seq, np.asarray(image, dtype=np.uint8))
-                self._seq += 1
-                height, width = frame.image.shape[:2]
-                detail = f"{width}x{height}, stamps: {'driver' if trusted else 'arrival'}"
-                loop.call_soon_threadsafe(emit, frame, detail, trusted)
+                picture = np.asarray(image, dtype=np.uint8)
+                height, width = picture.shape[:2]
+                detail = f"{width}x{height} {fourcc}, stamps: {'driver' if trusted else 'arrival'}"
+                emit(Shot(t_ns, picture, detail, {"arrival_stamps": not trusted}))
         finally:
             capture.release()
+
+
+def _format(capture: Capture) -> str:
+    """The pixel format in use, four letters; empty where the driver does not say."""
+    code = int(capture.get(cv2.CAP_PROP_FOURCC))
+    return code.to_bytes(4, "little").decode("ascii", "replace") if 0 < code < 1 << 32 else ""
 
 
 def open_v4l2(device: str) -> Capture:

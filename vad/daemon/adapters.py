@@ -11,18 +11,22 @@ from vad.bus.session import local_endpoints, tls_endpoints
 from vad.camera.folder import FolderCamera, Recording
 from vad.camera.frame import CameraSource
 from vad.camera.http_stream import HttpStreamCamera
+from vad.camera.kinect2_source import Kinect2Camera
+from vad.camera.rtsp import RtspCamera
 from vad.camera.v4l2 import V4l2Camera, V4l2Settings
 from vad.config import (
     CameraSettings,
     ConnectorCsi,
     DeviceSettings,
     FolderCameraSettings,
+    Kinect2CameraSettings,
     LineRobot,
     MjpegCameraSettings,
     NeatoRobot,
     RadioSettings,
     RoombaRobot,
     Ros2Robot,
+    RtspCameraSettings,
     Settings,
     ValetudoRobot,
     pki_folder,
@@ -94,8 +98,12 @@ def camera_source(settings: CameraSettings, base: Path) -> CameraSource:
         return HttpStreamCamera(source.url)
     if isinstance(source, FolderCameraSettings):
         return FolderCamera(Recording(base / source.path))
+    if isinstance(source, RtspCameraSettings):
+        return RtspCamera(source.url, transport=source.transport)
+    if isinstance(source, Kinect2CameraSettings):
+        return Kinect2Camera(serial=source.serial, fraction=source.fraction, fps=source.fps)
     return V4l2Camera(
-        V4l2Settings(source.device, width_px=source.width_px, height_px=source.height_px, fps=source.fps)
+        V4l2Settings(source.device, source.width_px, source.height_px, source.fps, fourcc=source.format)
     )
 
 

@@ -1,0 +1,148 @@
+"""The RTSP camera against a server that speaks RTSP and RTP byte for byte, and against GStreamer's own."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from rtsp_world import RtspServer
+
+from vad.camera.frame import Frame
+from vad.camera.rtsp import RtspCamera, Transport
+from vad.errors import ConfigError
+from vad.streams import DropOldestQueue
+
+STRIPES = 8
+
+
+def picture(k: int) -> NDArray[np.uint8]:
+    """The number `k` (8 bits) as dark and bright stripes: survives JPEG and video coding."""
+    image = np.zeros((96, 128, 3), np.uint8)
+    for bit in range(STRIPES):
+        image[:, bit * 16 : bit * 16 + 16] = 230 if k >> bit & 1 else 20
+    return image
+
+
+def number(image: NDArray[np.uint8]) -> int:
+    means = image.reshape(image.shape[0], STRIPES, -1).mean((0, 2))
+    return sum(int(mean > 128) << bit for bit, mean in enumerate(means))
+
+
+async def until(condition: Callable[[], bool], timeout_s: float = 15.0) -> None:
+    async with asyncio.timeout(timeout_s):
+        while not condition():  # noqa: ASYNC110
+            await asyncio.sleep(0.005)
+
+
+@asynccontextmanager
+async def running(camera: RtspCamera, depth: int = 500) -> AsyncIterator[DropOldestQueue[Frame]]:
+    out: DropOldestQueue[Frame] = DropOldestQueue(depth)
+    task = asyncio.create_task(camera.run(out))
+    try:
+        yield out
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        assert not [t for t in threading.enumerate() if t.name.startswith("rtsp")]
+
+
+async def test_pictures_come_in_order_with_the_streams_times() -> None:
+    async with RtspServer(picture, fps=25.0) as server:
+        camera = RtspCamera(f"rtsp://127.0.0.1:{server.port}/live")
+        async with running(camera) as out:
+            await until(lambda: len(out) >= 20)
+            frames = out.drain()
+        assert camera.health.state == "ok"
+        assert camera.health.detail == "128x96, stamps: stream"
+        numbers = [number(f.image) for f in frames]
+        assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+        # Evenly spaced as they were taken, whatever the arrival; and close to when they were sent.
+        steps_ms = np.diff([f.t_ns for f in frames][5:]) * 1e-6
+        assert np.median(steps_ms) == pytest.approx(40.0, abs=1.0)
+        late_ms = [(f.t_ns - server.sent[n][1]) * 1e-6 for f, n in zip(frames, numbers, strict=True)]
+        assert -5.0 < np.median(late_ms) < 400.0
+        assert np.ptp(late_ms[5:]) < 30.0
+        assert [f.seq for f in frames] == list(range(len(frames)))
+
+
+async def test_a_server_that_goes_and_comes_back() -> None:
+    async with RtspServer(picture) as server:
+        camera = RtspCamera(f"rtsp://user:secret@127.0.0.1:{server.port}/live")
+        async with running(camera) as out:
+            await until(lambda: len(out) >= 3)
+            await server.close()
+            await until(lambda: camera.health.state == "degraded")
+            assert "secret" not in camera.health.detail
+            assert f"127.0.0.1:{server.port}" in camera.health.detail
+            await server.listen()
+            out.drain()
+            await until(lambda: len(out) >= 3)
+            assert camera.health.state == "ok"
+            assert camera.health.counters["reopens"] >= 1
+
+
+async def test_the_newest_pictures_win_and_the_others_are_counted() -> None:
+    async with RtspServer(picture, fps=50.0) as server:
+        camera = RtspCamera(f"rtsp://127.0.0.1:{server.port}/live")
+        async with running(camera, depth=2) as out:
+            await until(lambda: camera.health.counters["frames"] >= 12)
+            frames = out.drain()
+            assert [f.seq for f in frames] == [
+                camera.health.counters["frames"] - 2,
+                camera.health.counters["frames"] - 1,
+            ]
+            assert camera.health.counters["dropped"] == camera.health.counters["frames"] - 2
+
+
+async def test_nobody_listens() -> None:
+    async with RtspServer(picture) as server:
+        port = server.port
+    camera = RtspCamera(f"rtsp://127.0.0.1:{port}/live")
+    async with running(camera):
+        await until(lambda: camera.health.state == "degraded")
+        assert "cannot be opened" in camera.health.detail
+
+
+class Still:
+    """A stream whose times do not advance, as some cameras send them."""
+
+    def __init__(self) -> None:
+        self._tick = threading.Event()
+
+    def isOpened(self) -> bool:  # noqa: N802
+        return True
+
+    def read(self) -> tuple[bool, NDArray[np.uint8]]:
+        self._tick.wait(0.005)
+        return True, picture(1)
+
+    def get(self, prop: int, /) -> float:
+        return 0.0
+
+    def release(self) -> None:
+        return
+
+
+async def test_times_that_do_not_advance_give_way_to_the_arrival() -> None:
+    def open_still(url: str, transport: Transport) -> Still:
+        return Still()
+
+    camera = RtspCamera("rtsp://camera/live", opener=open_still)
+    async with running(camera) as out:
+        await until(lambda: len(out) >= 20)
+        last = out.drain()[-1]
+        assert camera.health.detail.endswith("arrival")
+        assert camera.health.counters["arrival_stamps"] >= 1
+        assert 0 <= time.monotonic_ns() - last.t_ns < 2_000_000_000
+
+
+@pytest.mark.parametrize("url", ["http://camera/live", "rtsp:///live", "rtsp://camera:port/live", "camera"])
+def test_addresses_that_are_none(url: str) -> None:
+    with pytest.raises(ConfigError):
+        RtspCamera(url)

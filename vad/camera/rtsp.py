@@ -1,0 +1,120 @@
+"""IP cameras over RTSP, through OpenCV's FFmpeg: one thread, the stream's own stamps, reopened."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, Literal, Protocol
+from urllib.parse import urlsplit
+
+import cv2
+import numpy as np
+
+from vad.camera.frame import Frame
+from vad.camera.threaded import Emit, Shot, run_reopening
+from vad.clock import ClockMap
+from vad.errors import ConfigError, SourceError
+from vad.health import Health
+from vad.streams import DropOldestQueue
+
+Transport = Literal["tcp", "udp"]
+
+# FFmpeg can only be told to give up, not woken: these bound how long the end of the daemon may take.
+_OPEN_TIMEOUT_MS = 4000
+_READ_TIMEOUT_MS = 3000
+_END_S = 4.5
+_FFMPEG_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
+_FFMPEG_LOG_LEVEL = "OPENCV_FFMPEG_LOGLEVEL"
+_FATAL_ONLY = "8"
+
+
+class Capture(Protocol):
+    """What is used of cv2.VideoCapture."""
+
+    def isOpened(self) -> bool: ...  # noqa: N802
+    def read(self) -> tuple[bool, Any]: ...
+    def get(self, prop: int, /) -> float: ...
+    def release(self) -> None: ...
+
+
+class RtspCamera:
+    """An RTSP stream as a camera; reconnects by itself.
+
+    The stream's presentation times are laid on the timeline by the least delay seen: jitter of network and
+    decoder goes, a constant delay of the camera (0.1-0.5 s is usual) stays in the times, and camera mapping
+    finds it.
+
+    Args:
+        url: `rtsp://[user:password@]host[:port]/path`. transport: udp loses packets, tcp waits for them.
+        part: the camera's name in health and logs. opener: opens the stream; OpenCV's FFmpeg by default.
+
+    Raises:
+        ConfigError: the address is not rtsp.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        *,
+        transport: Transport = "tcp",
+        part: str = "camera",
+        opener: Callable[[str, Transport], Capture] | None = None,
+    ) -> None:
+        try:
+            address = urlsplit(url)
+            port = address.port
+        except ValueError as error:
+            raise ConfigError("the camera's address cannot be read", remedy=str(error)) from error
+        if address.scheme not in ("rtsp", "rtsps") or not address.hostname:
+            remedy = "give rtsp://[user:password@]host[:port]/path"
+            raise ConfigError("the address is not an RTSP one", where=part, remedy=remedy)
+        self.health = Health(part)
+        # Without the password, which the address may hold.
+        self._where = f"{address.hostname}:{port or 554}"
+        self._url = url
+        self._transport = transport
+        self._opener = opener or open_rtsp
+
+    async def run(self, out: DropOldestQueue[Frame]) -> None:
+        """Emit frames into `out` until cancelled."""
+        await run_reopening(self._session, out, self.health, name=f"rtsp {self._where}", end_s=_END_S)
+
+    def _session(self, stop: threading.Event, emit: Emit) -> None:
+        capture = self._opener(self._url, self._transport)
+        clock, restarts = ClockMap(), 0
+        try:
+            if not capture.isOpened():
+                remedy = "see whether it is on, and whether the path, user and password are right"
+                raise SourceError("the camera cannot be opened", where=self._where, remedy=remedy)
+            while not stop.is_set():
+                good, image = capture.read()
+                arrival_ns = time.monotonic_ns()
+                if not good or image is None:
+                    raise SourceError("the camera has stopped sending", where=self._where)
+                since_start_us = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e3)
+                counter = np.array([since_start_us & 0xFFFFFFFF], np.uint32)
+                t_ns = int(clock.update(counter, np.array([arrival_ns], np.int64))[0])
+                picture = np.asarray(image, dtype=np.uint8)
+                height, width = picture.shape[:2]
+                stamps = "arrival" if clock.still else "stream"
+                counts = {"arrival_stamps": int(clock.still), "clock_restarts": clock.restarts - restarts}
+                restarts = clock.restarts
+                emit(Shot(min(t_ns, arrival_ns), picture, f"{width}x{height}, stamps: {stamps}", counts))
+        finally:
+            capture.release()
+
+
+def open_rtsp(url: str, transport: Transport) -> Capture:
+    """Open a stream with OpenCV's FFmpeg back-end; what it waits for is bounded."""
+    # OpenCV reads these at each opening; there is no other way to tell FFmpeg.
+    os.environ[_FFMPEG_OPTIONS] = f"rtsp_transport;{transport}|fflags;nobuffer"
+    os.environ.setdefault(_FFMPEG_LOG_LEVEL, _FATAL_ONLY)
+    limits = [
+        cv2.CAP_PROP_OPEN_TIMEOUT_MSEC,
+        _OPEN_TIMEOUT_MS,
+        cv2.CAP_PROP_READ_TIMEOUT_MSEC,
+        _READ_TIMEOUT_MS,
+    ]
+    return cv2.VideoCapture(url, cv2.CAP_FFMPEG, limits)
