@@ -163,7 +163,7 @@ class Daemon:
             camera.health,
             eyes.health,
             csi.health,
-            captures.traffic.health,
+            *captures.parts,
             self._bus.health,
             *([self._gate.health] if self._gate is not None else []),
         ]

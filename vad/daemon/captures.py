@@ -1,13 +1,12 @@
-"""Who is measured when: waits for a walker, leads the handshake, writes the session, has it solved."""
+"""Who is measured when: asks the schedule, has walks recorded and solved, tells what became of them."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import logging
-import threading
 import time
-from dataclasses import dataclass
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -16,7 +15,18 @@ import numpy as np
 
 from vad.bus import messages as m
 from vad.bus.node import Bus
-from vad.capture.handshake import CameraSide, Message, WifiSide
+from vad.capture.airtime import Airtime
+from vad.capture.archive import CaptureResult, close_cut_off, note_result, session_id
+from vad.capture.quota import enforce
+from vad.capture.schedule import (
+    MIN_PACKETS_PER_S,
+    NO_CALIBRATION,
+    Candidate,
+    Decision,
+    Limits,
+    Schedule,
+    View,
+)
 from vad.capture.session import (
     SCHEMA,
     SessionAnchor,
@@ -27,42 +37,30 @@ from vad.capture.session import (
 )
 from vad.capture.session_writer import SessionWriter
 from vad.config import Settings
+from vad.daemon.decisions import DecisionLog
 from vad.daemon.ears import Ears
 from vad.daemon.eyes import Eyes
+from vad.daemon.findings import Findings
 from vad.daemon.registry import Registry
+from vad.daemon.solver import Solver
+from vad.daemon.solver_child import SolvedWalk
 from vad.daemon.threads import to_the_end
 from vad.daemon.traffic import Traffic
+from vad.daemon.walk import Recorded, WalkRecorder
 from vad.errors import SessionError
+from vad.health import Health
 from vad.robot.floor_plan import FloorPlan
-from vad.solve import Solved, solve_session
 from vad.store.records import DeviceRecord
-from vad.vision.tracks import SmoothTrack
 
 _log = logging.getLogger(__name__)
 
 TICK_S = 0.1
-MIN_PACKETS_PER_S = 60.0
-WALKER_GONE_NS = 1_500_000_000
-CAMERA_GIVES_UP_NS = 60_000_000_000
 UNWRITABLE_PAUSE_S = 5.0
 """Before the next try where no session folder can be made."""
+STOPPED = "the daemon stopped"
 
-
-@dataclass(slots=True)
-class _Capture:
-    """One capture under way."""
-
-    session: str
-    mac: str
-    track: int
-    wifi: WifiSide
-    camera: CameraSide
-    writer: SessionWriter
-    begun_ns: int
-    to_wifi: list[Message]
-
-    def seconds(self, now_ns: int) -> float:
-        return (now_ns - self.begun_ns) / 1e9
+_WAITING = ("discovered", "waiting", "stale", "capturing")
+"""States in which a device says what it waits for; a mapped or a failed one keeps what it says."""
 
 
 class Captures:
@@ -78,245 +76,289 @@ class Captures:
         registry: Registry,
         bus: Bus,
     ) -> None:
+        limits = settings.capture
         self.step = "starting"
-        self.traffic = Traffic(settings)
         self._settings = settings
         self._plan = plan
         self._eyes = eyes
         self._ears = ears
         self._registry = registry
         self._bus = bus
-        self._sessions = state_dir / "sessions"
-        self._failed: dict[str, str] = {}  # why the last walk of a device could not be used
+        self._archive = state_dir / "sessions"
+        self._decisions = DecisionLog(state_dir)
+        self._traffic = Traffic(settings.radio.traffic_packets_per_s, registry.ip_of)
+        self._solver = Solver()
+        self._findings = Findings(registry)
+        self._schedule = Schedule(Limits(limits.together, int(limits.recheck_h * 3600e9)))
+        self._airtime = Airtime(limits.airtime_percent / 100, time.monotonic_ns())
+
+    @property
+    def parts(self) -> Sequence[Health]:
+        """The health of what this owns."""
+        return self._decisions.health, self._traffic.health, self._solver.health
 
     def use_plan(self, plan: FloorPlan) -> None:
         """Go on with another floor plan; a walk that began on another epoch is not used."""
         self._plan = plan
 
+    def joined(self, mac: str) -> None:
+        """The device joined the network, for the first time or again."""
+        self._schedule.look_again(time.monotonic_ns(), mac)
+
     async def run(self) -> None:
         """Measure devices until cancelled."""
         try:
+            await self._tidy_up()
             while True:
                 await asyncio.sleep(TICK_S)
-                ready = await self._ready(time.monotonic_ns())
-                if ready is not None:
-                    await self._capture(*ready)
+                decision = self._decide(time.monotonic_ns())
+                await self._follow(decision)
+                await self._decisions.flush()
         finally:
-            await self.traffic.stop()
+            await self._traffic.stop()
+            await self._solver.close()
+            await self._decisions.close()
 
-    async def _ready(self, now_ns: int) -> tuple[DeviceRecord, int] | None:
-        """The device to measure now and the track of its walker; else says what is waited for."""
+    def _decide(self, now_ns: int) -> Decision:
+        limits = self._settings.capture
         calibration = self._eyes.calibration
-        waiting = self._registry.waiting()
+        calibrating = ""
         if calibration.status != "valid":
-            self.step = f"calibrating the camera: {calibration.percent} %, {calibration.reason}"
-            for device in waiting:
-                await self._registry.wait(device.mac, "the camera does not know yet where it is")
-            return None
-        walker = self._eyes.lone_mover(self._eyes.last_frame_ns)
-        if not waiting:
-            await self.traffic.stop()
-            self.step = "watching: no device waits to be measured"
-            return None
-        await self._provoke(waiting, now_ns, somebody_walks=walker is not None)
-        heard = [d for d in waiting if self._ears.heard_per_s(d.mac, now_ns) >= MIN_PACKETS_PER_S]
-        for device in waiting:
-            if device not in heard and not self.traffic.reaches(device.mac):
-                # A reason that changed with every packet would be published with every packet.
-                why = self._ears.why_unheard(device.mac, now_ns)
-                await self._registry.wait(device.mac, why or "too few CSI packets of it are heard")
-        within_reach = [d for d in waiting if d in heard or self.traffic.reaches(d.mac)]
-        if not within_reach:
-            self.step = "waiting for CSI packets of a device"
-            return None
-        self.step = "waiting for somebody to walk through the picture"
-        for device in within_reach:
-            await self._registry.wait(device.mac, self._wish(device.mac))
-        return None if walker is None or not heard else (heard[0], walker)
+            calibrating = f"{calibration.percent} %, {calibration.reason}"
+        self._airtime.spend(now_ns, self._traffic.sent())
+        rate = self._settings.radio.traffic_packets_per_s
+        return self._schedule.decide(
+            now_ns,
+            [self._candidate(record, now_ns) for record in self._registry.all()],
+            View(calibrating, self._eyes.movers()),
+            airtime=self._airtime.allows(now_ns, rate, limits.max_s),
+        )
 
-    def _wish(self, mac: str) -> str:
-        """What would tell more of the device, and why its last walk told nothing."""
-        wish = self._registry.wish(mac)
-        return f"{self._failed[mac]}; {wish}" if mac in self._failed else wish
+    def _candidate(self, record: DeviceRecord, now_ns: int) -> Candidate:
+        address = self._registry.sends_as(record.mac)
+        heard = self._ears.heard_per_s(address, now_ns)
+        return Candidate(
+            record.mac,
+            record.name or record.mac,
+            record.state,
+            record.walks,
+            self._findings.doubted(record.mac),
+            heard,
+            self._traffic.reaches(record.mac),
+            "" if heard >= MIN_PACKETS_PER_S else self._ears.why_unheard(address, now_ns),
+            self._registry.wish(record.mac),
+        )
 
-    async def _provoke(self, waiting: list[DeviceRecord], now_ns: int, *, somebody_walks: bool) -> None:
-        """While somebody walks, make the first device send that does not do so by itself."""
-        for device in waiting if somebody_walks else ():
-            if self.traffic.reaches(device.mac):
-                await self.traffic.towards(device.mac)
-                return
-            if self._ears.heard_per_s(device.mac, now_ns) >= MIN_PACKETS_PER_S:
-                break
-        await self.traffic.stop()
+    async def _follow(self, decision: Decision) -> None:
+        """Do what was decided, and say it."""
+        self.step = decision.step
+        seeing = self._eyes.calibration.status == "valid"
+        self._decisions.tell(decision.step if seeing else NO_CALIBRATION)  # without its many percentages
+        for mac, reason in decision.waits.items():
+            record = self._registry.get(mac)
+            if record.state in _WAITING:
+                await self._registry.wait(mac, reason)
+            if seeing and reason != decision.step and not reason.endswith(self._registry.wish(mac)):
+                self._decisions.tell(f"{record.name or mac} waits: {reason}", mac)
+        await self._traffic.towards(decision.provoke)
+        if decision.record and decision.track is not None:
+            await self._capture(decision.record, decision.track)
 
-    async def _capture(self, device: DeviceRecord, track: int) -> None:
+    async def _capture(self, macs: tuple[str, ...], track: int) -> None:
+        before = [self._registry.get(mac) for mac in macs]
         try:
-            capture = await self._begin(device, track)
+            walk = await self._begin(before, track)
         except OSError as error:
-            await self._give_up(device.mac, _unwritable(error))
+            await self._void(macs, _unwritable(error), its_fault=False)
+            await self._keep_quota()
             await asyncio.sleep(UNWRITABLE_PAUSE_S)
             return
-        unfinished = "the daemon stopped"
+        unfinished = STOPPED
         try:
-            await self._registry.capturing(device.mac)
-            await self._record(capture)
+            for record in before:
+                if record.state in _WAITING:  # one that is looked at again stays what it is meanwhile
+                    await self._registry.capturing(record.mac)
+            recorded = await walk.record(partial(self._say, walk))
             unfinished = ""
         except OSError as error:
             unfinished = _unwritable(error)
         finally:
-            self._ears.stop_recording()
             if unfinished:
-                # The folder must not look like one that is still being recorded.
-                capture.wifi.abort(unfinished)
+                # The folders must not look like ones that are still being recorded.
+                walk.wifi.abort(unfinished)
                 with contextlib.suppress(OSError):
-                    capture.writer.abort(unfinished)
-            await self.traffic.stop()
-        if capture.wifi.state == "solving":
-            await self._solve(capture)
-        if capture.wifi.state == "aborted":
-            await self._give_up(device.mac, capture.wifi.reason)
-            self._publish(capture)
+                    walk.writer.abort(unfinished)
+            await self._traffic.stop()
+        if unfinished:
+            recorded = Recorded(False, unfinished)
+        if recorded.complete:
+            self._decisions.tell(f"{walk.seconds:.0f} s walked: {recorded.reason}")
+            await self._solve(walk)
+        else:
+            await self._void(macs, recorded.reason, its_fault=recorded.its_fault)
+            for mac in macs:
+                self._publish(walk, mac, "aborted", recorded.reason)
+        await self._keep_quota()
 
-    async def _give_up(self, mac: str, reason: str) -> None:
-        _log.info("capture of %s aborted: %s", mac, reason)
-        self._failed[mac] = reason
-        await self._registry.wait(mac, self._wish(mac))
+    async def _void(self, macs: Sequence[str], reason: str, *, its_fault: bool) -> None:
+        """A walk told nothing of these devices."""
+        for mac in macs:
+            self._schedule.failed(time.monotonic_ns(), mac, reason, its_fault=its_fault)
+            record = self._registry.get(mac)
+            self._decisions.tell(f"{record.name or mac}: the walk is void: {reason}", mac)
+            if record.state in _WAITING:
+                await self._registry.wait(mac, f"{reason}; {self._registry.wish(mac)}")
 
-    async def _begin(self, device: DeviceRecord, track: int) -> _Capture:
-        now_ns = time.monotonic_ns()
-        stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S.%f")[:-3]
-        session = f"{stamp}-{device.mac.replace(':', '')}"
-        header = self._header(session, device)
+    async def _begin(self, records: list[DeviceRecord], track: int) -> WalkRecorder:
+        now = datetime.now(UTC)
+        headers = [self._header(now, record) for record in records]
         opening = asyncio.get_running_loop().run_in_executor(
-            None, SessionWriter, self._sessions / session, header
+            None, SessionWriter, self._archive / headers[0].id, headers[0], headers[1:]
         )
         try:
             writer = await asyncio.shield(opening)
         except asyncio.CancelledError:
             await asyncio.wait({opening})
             if opening.exception() is None:
-                opening.result().abort("the daemon stopped")
+                opening.result().abort(STOPPED)
             raise
-        camera = CameraSide(session, max_record_ns=CAMERA_GIVES_UP_NS)
-        return _Capture(session, device.mac, track, WifiSide(session), camera, writer, now_ns, [])
+        return WalkRecorder(
+            self._settings.capture,
+            self._eyes,
+            self._ears,
+            self._registry,
+            self._findings,
+            self._solver,
+            session=headers[0].id,
+            macs=tuple(record.mac for record in records),
+            track=track,
+            writer=writer,
+        )
 
-    def _header(self, session: str, device: DeviceRecord) -> SessionHeader:
+    def _header(self, now: datetime, record: DeviceRecord) -> SessionHeader:
         position = self._eyes.calibration.position_m
         assert position is not None  # only a valid calibration gets here
-        anchor = position + np.array(self._settings.radio.antenna_offset_m)
+        radio = self._settings.radio
+        anchor = position + np.array(radio.antenna_offset_m)
+        address = self._registry.sends_as(record.mac)
         return SessionHeader(
             schema=SCHEMA,
-            id=session,
+            id=session_id(now, address),
             source=self._settings.source,
-            device=SessionDevice(device.mac, device.name),
+            device=SessionDevice(address, record.name),
             anchor=SessionAnchor(float(anchor[0]), float(anchor[1]), float(anchor[2])),
-            radio=SessionRadio(
-                "intel5300", self._settings.radio.carrier_hz, self._settings.radio.bandwidth_mhz, "anchor"
-            ),
+            radio=SessionRadio("intel5300", radio.carrier_hz, radio.bandwidth_mhz, "anchor"),
             map=SessionMap(self._plan.epoch, self._plan.bounds_m),
         )
 
-    async def _record(self, capture: _Capture) -> None:
-        """From arming to the complete folder, or to an aborted handshake."""
-
-        def frame_seen(t_ns: int) -> None:
-            capture.to_wifi += capture.camera.frame(t_ns, time.monotonic_ns())
-
-        self._ears.start_recording()
-        forget = self._eyes.listen(frame_seen)
-        try:
-            self._to_camera(capture, capture.wifi.arm(time.monotonic_ns()))
-            while capture.wifi.state in ("armed", "recording", "stopping"):
-                await asyncio.sleep(TICK_S)
-                self._exchange(capture)
-                await self._ears.drain(capture.writer)
-                self._say(capture)
-        finally:
-            forget()
-        if capture.wifi.state == "solving":
-            await self._write_walk(capture)
+    async def _solve(self, walk: WalkRecorder) -> None:
+        """Solve the walk for each of its devices; it is done where it told something of one of them."""
+        self._say_solving(walk)
+        told, useless = False, ""
+        for mac, folder in zip(walk.macs, walk.writer.folders, strict=True):
+            self.step = f"working out where {self._registry.get(mac).name or mac} is"
+            try:
+                solved = await self._solver.solve(folder)
+                reason, its_fault = self._useless(solved)
+            except SessionError as error:
+                reason, its_fault = str(error), False
+            if not reason:
+                told = True
+                self._publish(walk, mac, "done", result=await self._take(mac, folder, solved))
+                continue
+            useless = useless or reason
+            await self._void((mac,), reason, its_fault=its_fault)
+            await self._note(folder, CaptureResult(note=reason))
+            self._publish(walk, mac, "aborted", reason)
+        if told:
+            walk.wifi.solved()
         else:
-            await to_the_end(partial(capture.writer.abort, capture.wifi.reason))
+            walk.wifi.abort(useless)
 
-    def _exchange(self, capture: _Capture) -> None:
-        """One round of the handshake: deliver, let time pass, decide whether the record is long enough."""
-        now_ns = time.monotonic_ns()
-        arrived, capture.to_wifi = capture.to_wifi, []
-        for message in arrived:
-            self._to_camera(capture, capture.wifi.receive(message, now_ns))
-        self._to_camera(capture, capture.wifi.tick(now_ns))
-        capture.to_wifi += capture.camera.tick(now_ns)
-        if capture.wifi.state != "recording":
-            return
-        limits = self._settings.capture
-        gone = self._eyes.last_frame_ns - self._eyes.seen_last_ns(capture.track) > WALKER_GONE_NS
-        alone = self._eyes.others_moving(capture.track, self._eyes.last_frame_ns) == 0
-        if not alone:
-            self._to_camera(capture, capture.wifi.abort("somebody else moved in the picture"))
-        elif capture.seconds(now_ns) >= limits.max_s or (gone and capture.seconds(now_ns) >= limits.min_s):
-            self._to_camera(capture, capture.wifi.finish(now_ns))
-        elif gone:
-            self._to_camera(capture, capture.wifi.abort("the walker left after a few seconds"))
+    def _useless(self, solved: SolvedWalk) -> tuple[str, bool]:
+        """Why a solved walk tells nothing, and whether that is the device's fault; empty where it does."""
+        if solved.epoch != self._plan.epoch:
+            return "the robot's map changed during the walk", False
+        if solved.posterior is None or solved.status == "refused":
+            return solved.reason, solved.packets < MIN_PACKETS_PER_S * solved.walk_s
+        return "", False
 
-    def _to_camera(self, capture: _Capture, messages: list[Message]) -> None:
-        for message in messages:
-            capture.to_wifi += capture.camera.receive(message, time.monotonic_ns())
+    async def _take(self, mac: str, folder: Path, solved: SolvedWalk) -> m.CaptureResult:
+        """The walk told something: the registry, the schedule, the log and the folder hear of it."""
+        finding = await self._findings.take(mac, solved)
+        blurred = self._registry.get(mac).state == "failed"
+        self._schedule.measured(time.monotonic_ns(), mac, blurred=blurred)
+        self._decisions.tell(finding.text, mac)
+        self._decisions.health.counters[finding.verdict.replace(" ", "_")] += 1
+        x_m, y_m = (float(v) for v in finding.place.xy_m)
+        radius_m = finding.place.radius90_m
+        await self._note(folder, CaptureResult(x_m, y_m, radius_m, finding.text))
+        return m.CaptureResult(x_m=x_m, y_m=y_m, radius90_m=radius_m)
 
-    async def _write_walk(self, capture: _Capture) -> None:
-        assert capture.wifi.first_frame_ns is not None
-        assert capture.wifi.last_frame_ns is not None
-        walk = await asyncio.to_thread(
-            self._eyes.track, capture.track, capture.wifi.first_frame_ns, capture.wifi.last_frame_ns
-        )
-        if walk is None:
-            capture.wifi.abort("the walker was seen in too few frames")
-            await to_the_end(partial(capture.writer.abort, capture.wifi.reason))
-            return
-        close = partial(capture.writer.close, walk.t_ns, walk.xy_m, _sigma_m(walk), capture.track)
-        await to_the_end(close)
-
-    async def _solve(self, capture: _Capture) -> None:
-        self.step = f"working out where {capture.mac} is"
-        self._publish(capture)
+    async def _note(self, folder: Path, result: CaptureResult) -> None:
         try:
-            solved = await _in_thread(capture.writer.folder)
+            await to_the_end(partial(note_result, folder, result))
+        except OSError as error:
+            _log.warning("%s: %s", folder, _unwritable(error))
+
+    async def _tidy_up(self) -> None:
+        """What a crash and a smaller quota leave to do."""
+        try:
+            cut_off = await to_the_end(partial(close_cut_off, self._archive))
+        except (OSError, SessionError) as error:
+            _log.warning("the sessions of earlier runs cannot be read: %s", error)
+            return
+        for folder in cut_off:
+            self._decisions.tell(f"{folder.name} was cut off: the daemon ended without warning")
+        await self._keep_quota()
+
+    async def _keep_quota(self) -> None:
+        limits = self._settings.capture
+        free = partial(
+            enforce,
+            self._archive,
+            quota_bytes=limits.quota_mb * 1_000_000,
+            keep_free_bytes=limits.keep_free_mb * 1_000_000,
+        )
+        try:
+            gone = await to_the_end(free)
         except SessionError as error:
-            capture.wifi.abort(str(error))
+            _log.warning("%s", error)
             return
-        if solved.session.header.map.epoch != self._plan.epoch:
-            capture.wifi.abort("the robot's map changed during the walk")
-            return
-        if solved.evidence.posterior is None or solved.evidence.status == "refused":
-            capture.wifi.abort(solved.evidence.reason)
-            return
-        walk_s = (solved.session.walk_t_ns[-1] - solved.session.walk_t_ns[0]) / 1e9
-        place = await self._registry.add_evidence(
-            capture.mac, solved.evidence.posterior, len(solved.session.t_ns), float(walk_s)
-        )
-        capture.wifi.solved()
-        self._failed.pop(capture.mac, None)
-        result = m.CaptureResult(
-            x_m=float(place.xy_m[0]), y_m=float(place.xy_m[1]), radius90_m=place.radius90_m
-        )
-        self._publish(capture, result)
+        if gone:
+            self._decisions.tell(f"{len(gone)} old sessions deleted to keep the quota, up to {gone[-1]}")
 
-    def _say(self, capture: _Capture) -> None:
-        walk_s = capture.seconds(time.monotonic_ns())
-        self.step = f"recording a walk for {capture.mac}: {walk_s:.0f} s, {capture.writer.packets} packets"
-        self._publish(capture)
+    def _say(self, walk: WalkRecorder) -> None:
+        names = ", ".join(self._registry.get(mac).name or mac for mac in walk.macs)
+        self.step = f"recording a walk for {names}: {walk.seconds:.0f} s, {walk.writer.packets} packets"
+        for mac in walk.macs:
+            self._publish(walk, mac, walk.wifi.state, walk.wifi.reason)
 
-    def _publish(self, capture: _Capture, result: m.CaptureResult | None = None) -> None:
-        walk_s = round(capture.seconds(time.monotonic_ns()))
+    def _say_solving(self, walk: WalkRecorder) -> None:
+        for mac in walk.macs:
+            self._publish(walk, mac, "solving")
+
+    def _publish(
+        self,
+        walk: WalkRecorder,
+        mac: str,
+        state: m.CaptureState,
+        reason: str = "",
+        result: m.CaptureResult | None = None,
+    ) -> None:
+        folder = walk.writer.folders[walk.macs.index(mac)]
+        walk_s = round(walk.seconds)
+        over = state in ("done", "aborted")
         self._bus.publish_capture(
             m.CaptureMessage(
                 source=self._settings.source,
-                session=capture.session,
-                mac=capture.mac,
-                state=capture.wifi.state,
-                reason=capture.wifi.reason,
-                packets=capture.writer.packets // 100 * 100,
+                session=folder.name,
+                mac=mac,
+                state=state,
+                reason=reason,
+                packets=walk.writer.packets_of(folder) // 100 * 100,
                 walk_s=walk_s,
-                progress=1.0 if capture.wifi.over else min(0.95, walk_s / self._settings.capture.max_s),
+                progress=1.0 if over else min(0.95, walk_s / self._settings.capture.max_s),
                 result=result,
             )
         )
@@ -324,17 +366,3 @@ class Captures:
 
 def _unwritable(error: OSError) -> str:
     return f"the session folder cannot be written ({error.strerror})"
-
-
-def _sigma_m(walk: SmoothTrack) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    """One standard deviation per axis from the covariances (M, 2, 2)."""
-    return np.asarray(np.sqrt(np.trace(walk.covariance_m2, axis1=1, axis2=2) / 2), dtype=np.float64)
-
-
-async def _in_thread(folder: Path) -> Solved:
-    """Solve in a thread that gives up soon after this task is cancelled."""
-    stop = threading.Event()
-    try:
-        return await asyncio.to_thread(solve_session, folder, None, stop.is_set)
-    finally:
-        stop.set()

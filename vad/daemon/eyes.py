@@ -20,7 +20,7 @@ from vad.streams import DropOldestQueue
 from vad.vision.ground import GroundPoint, ground_point
 from vad.vision.people import MotionGate, PoseNetwork
 from vad.vision.robot import RobotCandidate, RobotFinder
-from vad.vision.tracks import SmoothTrack, Track, Tracker, lone_mover, movers, smooth
+from vad.vision.tracks import Track, Tracker, movers
 
 _log = logging.getLogger(__name__)
 
@@ -48,6 +48,9 @@ class Eyes:
         network: finds people. max_fps: frames above this rate are left out. focal_px: of a known lens.
         known: a calibration of the same map epoch from an earlier run.
         on_calibration: called on the loop when the calibration changed.
+
+    Attributes:
+        last_image: the picture of the last frame seen, not to be changed.
     """
 
     def __init__(
@@ -63,6 +66,7 @@ class Eyes:
         self.calibration = known or CameraCalibration("uncalibrated", 0, "no robot poses have come yet")
         self.frames = 0
         self.last_frame_ns = 0
+        self.last_image: NDArray[np.uint8] | None = None
         self._network = network
         self._focal_px = focal_px
         self._step_ns = int(0.9e9 / max_fps)
@@ -83,23 +87,29 @@ class Eyes:
         self._frame_listeners.append(listener)
         return lambda: self._frame_listeners.remove(listener)
 
-    def lone_mover(self, now_ns: int) -> int | None:
-        """The id of the one person who moves; None when nobody or several do."""
-        return lone_mover(self._tracker.tracks(), now_ns)
-
     def others_moving(self, track_id: int, now_ns: int) -> int:
         """How many people besides this one move now."""
         return sum(mover != track_id for mover in movers(self._tracker.tracks(), now_ns))
 
-    def track(self, track_id: int, from_ns: int, to_ns: int) -> SmoothTrack | None:
-        """The smoothed walk of one person within [from_ns, to_ns]; None when too short to be smoothed."""
+    def movers(self) -> tuple[int, ...]:
+        """The ids of all who move in the last frame."""
+        return tuple(movers(self._tracker.tracks(), self.last_frame_ns))
+
+    def place_of(self, track_id: int) -> tuple[float, float] | None:
+        """Where this person was seen last, map frame; None for an unknown track."""
+        found = (t.xy_m[-1] for t in self._tracker.tracks() if t.id == track_id)
+        place = next(found, None)
+        return None if place is None else (float(place[0]), float(place[1]))
+
+    def track(self, track_id: int, from_ns: int, to_ns: int) -> Track | None:
+        """The track of one person within [from_ns, to_ns]; None when too short to be smoothed."""
         for track in self._tracker.tracks():
             if track.id == track_id:
                 inside = (track.t_ns >= from_ns) & (track.t_ns <= to_ns)
                 part = Track(
                     track.id, track.t_ns[inside], track.xy_m[inside], track.covariance_m2[inside], True
                 )
-                return smooth(part) if inside.sum() >= MIN_FRAMES else None
+                return part if inside.sum() >= MIN_FRAMES else None
         return None
 
     def seen_last_ns(self, track_id: int) -> int:
@@ -136,6 +146,7 @@ class Eyes:
         seen = await asyncio.to_thread(self._see, frame.image, robot_moves)
         self.frames += 1
         self.last_frame_ns = frame.t_ns
+        self.last_image = frame.image
         self.health.counters["frames"] += 1
         self.health.counters["people"] += seen.people
         mapper = self._mapper_for(frame.image)

@@ -13,6 +13,7 @@ from vad.capture.moved import contradicts
 from vad.daemon.registry import Registry
 from vad.daemon.solver_child import SolvedWalk
 from vad.mapping.device_stage import PlaceEstimate, place_from_posterior
+from vad.mapping.posterior import Posterior
 
 Verdict = Literal["sharper", "contradicts", "moved", "begun anew"]
 
@@ -42,6 +43,14 @@ class Findings:
     def doubted(self, mac: str) -> bool:
         """Whether the device's last walk contradicts its map."""
         return mac in self._doubts
+
+    async def enough(self, mac: str, posterior: Posterior) -> bool:
+        """Whether this much of a walk would leave the device mapped; not where it contradicts the map: what
+        it says had better be sure."""
+        before = await self._registry.known_posterior(mac, posterior.grid)
+        if before is None or contradicts(before, posterior):
+            return False
+        return await self._registry.would_be_mapped(mac, posterior)
 
     async def take(self, mac: str, walk: SolvedWalk) -> Finding:
         """Judge a walk that has a posterior, and tell the registry."""

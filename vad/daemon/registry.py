@@ -41,6 +41,7 @@ class Registry:
         self._devices: dict[str, DeviceRecord] = {}
         self._ignored = {normal_mac(mac) for mac in settings.devices.ignore}
         self._names = {normal_mac(d.mac): d.name for d in settings.devices.static}
+        self._addresses = {normal_mac(d.mac): d.ip for d in settings.devices.static}
 
     async def load(self) -> None:
         """What earlier runs knew; coordinates of another map epoch are stale, a cut-off capture waits."""
@@ -133,6 +134,14 @@ class Registry:
         """A capture of this device has begun."""
         await self._keep(replace(self._devices[mac], state="capturing", reason=""))
 
+    def sends_as(self, mac: str) -> str:
+        """The address that the device sends with."""
+        return self._devices[mac].mac
+
+    def ip_of(self, mac: str) -> str | None:
+        """The device's IPv4 address, where it is known."""
+        return self._addresses.get(mac)
+
     async def known_posterior(self, mac: str, grid: Grid) -> Posterior | None:
         """What all walks so far say together; None where nothing of this map epoch is known."""
         known = self._devices[mac]
@@ -160,6 +169,16 @@ class Registry:
     def room_at(self, x_m: float, y_m: float) -> str | None:
         """The room of a place of the present map."""
         return self._plan.room_at(x_m, y_m)
+
+    async def would_be_mapped(self, mac: str, evidence: Posterior) -> bool:
+        """Whether this much of a walk would make the device a mapped one."""
+        known = self._devices[mac]
+        before = await self._posterior_of(known, evidence.grid)
+        total = evidence if before is None else before.fused(evidence)
+        walks = 1 if before is None else known.walks + 1
+        place = place_from_posterior(joint_posterior(total, walks))
+        enough = place.status == "located" and place.radius90_m <= self._settings.capture.mapped_radius_m
+        return enough and walks >= self._settings.capture.min_walks
 
     async def add_evidence(
         self, mac: str, evidence: Posterior, packets: int, walk_s: float, *, anew: bool = False
