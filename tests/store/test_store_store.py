@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import sqlite3
 import stat
 import subprocess
 import sys
@@ -18,6 +17,7 @@ import pytest
 
 from vad.store.migrations import MIGRATIONS
 from vad.store.records import (
+    AgentRecord,
     CameraRecord,
     DeviceRecord,
     EpochRecord,
@@ -62,9 +62,11 @@ def posterior(seed: int = 1) -> PosteriorRecord:
 def test_everything_written_is_there_after_a_restart(tmp_path: Path) -> None:
     path = tmp_path / "state" / "vad.db"
     camera = CameraRecord("front", 3, {"map_from_image": [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]}, T1)
-    with Store(path) as store:
+    with Store(path, now=iter([T0, T1]).__next__) as store:
         store.save_device(WAITING)
         store.save_device(MAPPED, posterior())
+        store.save_agent(AgentRecord("attic", {"csi": "intel5300"}, T0, T0))
+        store.save_agent(AgentRecord("attic", {"csi": "intel5300", "wired": True}, T1, T1))
         store.save_camera(camera)
         store.save_camera(replace(camera, epoch=2))
         store.save_epoch(EpochRecord(2, "old", T0))
@@ -84,9 +86,12 @@ def test_everything_written_is_there_after_a_restart(tmp_path: Path) -> None:
         assert store.cameras(4) == []
         assert store.last_epoch() == EpochRecord(3, "new", T1)
         assert store.history(MAC) == [
-            HistoryRecord(MAC, T1, "mapped", 3, 1.25, -0.5, 0.61),
-            HistoryRecord(MAC, T0, "waiting", 3),
+            HistoryRecord(
+                MAC, T1, "mapped", 3, 1.25, -0.5, 0.61, "lamp", "Küche", 2, ((0.04, 0.01), (0.01, 0.09))
+            ),
+            HistoryRecord(MAC, T0, "waiting", 3, name="lamp"),
         ]
+        assert store.agents() == [AgentRecord("attic", {"csi": "intel5300", "wired": True}, T0, T1)]
 
 
 def test_the_file_is_readable_by_its_owner_only(tmp_path: Path) -> None:
@@ -201,18 +206,17 @@ def test_a_folder_in_the_way_is_an_error_with_a_remedy(tmp_path: Path) -> None:
         Store(tmp_path / "file" / "vad.db")
 
 
-def test_a_locked_file_is_no_damage(tmp_path: Path) -> None:
+def test_a_file_in_use_is_refused_and_no_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "vad.db"
+    monkeypatch.setattr("vad.store.opening.BUSY_TIMEOUT_S", 0.05)
     with Store(path) as store:
-        store._db.execute("PRAGMA busy_timeout = 50")
-        other = sqlite3.connect(path, isolation_level=None)
-        other.execute("BEGIN IMMEDIATE")
-        with pytest.raises(StoreError, match="locked"):
-            store.save_device(WAITING)
-        other.execute("ROLLBACK")
-        other.close()
         store.save_device(WAITING)
-        assert store.devices() == [WAITING]
+        with pytest.raises(StoreError, match=r"locked\. Another vad uses it"):
+            Store(path)
+        store.save_device(MAPPED)
+    with Store(path) as store:
+        assert store.set_aside is None
+        assert store.devices() == [MAPPED]
 
 
 def test_what_was_acknowledged_survives_kill_9(tmp_path: Path) -> None:

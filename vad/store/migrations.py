@@ -53,5 +53,19 @@ MIGRATIONS: tuple[str, ...] = (
     );
     CREATE INDEX history_by_device ON history (mac, at);
     """,
+    """
+    ALTER TABLE history ADD COLUMN name TEXT;
+    ALTER TABLE history ADD COLUMN room TEXT;
+    ALTER TABLE history ADD COLUMN walks INTEGER NOT NULL DEFAULT 0;
+    ALTER TABLE history ADD COLUMN var_x_m2 REAL;
+    ALTER TABLE history ADD COLUMN cov_xy_m2 REAL;
+    ALTER TABLE history ADD COLUMN var_y_m2 REAL;
+    CREATE TABLE agents (
+        id TEXT PRIMARY KEY,
+        info TEXT NOT NULL,
+        first_seen TEXT NOT NULL,
+        last_seen TEXT NOT NULL
+    ) WITHOUT ROWID;
+    """,
 )
 """Step i leads from version i to i + 1."""

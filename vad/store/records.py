@@ -78,7 +78,7 @@ class EpochRecord:
 
 @dataclass(frozen=True, slots=True)
 class HistoryRecord:
-    """What was said of a device at one time; coordinates None where it had none."""
+    """What was said of a device from `at` (wall time of the writing) on; no coordinates: it had none."""
 
     mac: str
     at: str
@@ -87,3 +87,30 @@ class HistoryRecord:
     x_m: float | None = None
     y_m: float | None = None
     radius90_m: float | None = None
+    name: str | None = None
+    room: str | None = None
+    walks: int = 0
+    covariance_m2: Covariance | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class PastRecord:
+    """What is known of a device at a time that has passed.
+
+    said: what was said of it then; None where that is not kept any more, for history is bounded. kept_since:
+    when the oldest entry that is kept was written; None where there is none.
+    """
+
+    mac: str
+    said: HistoryRecord | None
+    kept_since: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class AgentRecord:
+    """A remote CSI node the hub has met. info: a JSON object whose meaning is the agent's part's."""
+
+    id: str
+    info: dict[str, Any]
+    first_seen: str
+    last_seen: str
