@@ -62,7 +62,7 @@ async def until(condition: Callable[[], bool], what: str, timeout_s: float = 10.
 def true_calibration(scenario: Scenario) -> CameraCalibration:
     """What a perfect drive would tell of the scenario's camera, with centimetres of doubt."""
     view = View.of(scenario.camera)
-    doubt = np.array([2e-3, 2e-3, 2e-3, 0.02, 0.02, 0.02, 5e-3, 1e-3])
+    doubt = np.array([2e-3, 2e-3, 2e-3, 0.02, 0.02, 0.02, 5e-3, 1e-3, 1e-3, 1.0, 1.0])
     assert len(doubt) == PARAMETERS
     return CameraCalibration(
         "valid",

@@ -15,18 +15,9 @@ import numpy as np
 
 from vad.bus import messages as m
 from vad.bus.node import Bus
-from vad.capture.airtime import Airtime
 from vad.capture.archive import CaptureResult, close_cut_off, note_result, session_id
 from vad.capture.quota import enforce
-from vad.capture.schedule import (
-    MIN_PACKETS_PER_S,
-    NO_CALIBRATION,
-    Candidate,
-    Decision,
-    Limits,
-    Schedule,
-    View,
-)
+from vad.capture.schedule import MIN_PACKETS_PER_S, Decision, View
 from vad.capture.session import (
     SCHEMA,
     SessionAnchor,
@@ -40,10 +31,9 @@ from vad.config import Settings
 from vad.daemon.decisions import DecisionLog
 from vad.daemon.ears import Ears
 from vad.daemon.eyes import Eyes
-from vad.daemon.findings import Findings
+from vad.daemon.measuring import Hearing, Measuring
 from vad.daemon.registry import Registry
 from vad.daemon.solver import Solver
-from vad.daemon.solver_child import SolvedWalk
 from vad.daemon.threads import to_the_end
 from vad.daemon.traffic import Traffic
 from vad.daemon.walk import Recorded, WalkRecorder
@@ -59,9 +49,6 @@ UNWRITABLE_PAUSE_S = 5.0
 """Before the next try where no session folder can be made."""
 STOPPED = "the daemon stopped"
 
-_WAITING = ("discovered", "waiting", "stale", "capturing")
-"""States in which a device says what it waits for; a mapped or a failed one keeps what it says."""
-
 
 class Captures:
     """The capture loop; `step` is one sentence for people about what is going on."""
@@ -76,7 +63,6 @@ class Captures:
         registry: Registry,
         bus: Bus,
     ) -> None:
-        limits = settings.capture
         self.step = "starting"
         self._settings = settings
         self._plan = plan
@@ -88,9 +74,13 @@ class Captures:
         self._decisions = DecisionLog(state_dir)
         self._traffic = Traffic(settings.radio.traffic_packets_per_s, registry.ip_of)
         self._solver = Solver()
-        self._findings = Findings(registry)
-        self._schedule = Schedule(Limits(limits.together, int(limits.recheck_h * 3600e9)))
-        self._airtime = Airtime(limits.airtime_percent / 100, time.monotonic_ns())
+        self._measuring = Measuring(
+            settings.capture,
+            registry,
+            self._decisions,
+            provoked_per_s=settings.radio.traffic_packets_per_s,
+            now_ns=time.monotonic_ns(),
+        )
 
     @property
     def parts(self) -> Sequence[Health]:
@@ -103,7 +93,7 @@ class Captures:
 
     def joined(self, mac: str) -> None:
         """The device joined the network, for the first time or again."""
-        self._schedule.look_again(time.monotonic_ns(), mac)
+        self._measuring.joined(mac, time.monotonic_ns())
 
     async def run(self) -> None:
         """Measure devices until cancelled."""
@@ -111,73 +101,44 @@ class Captures:
             await self._tidy_up()
             while True:
                 await asyncio.sleep(TICK_S)
-                decision = self._decide(time.monotonic_ns())
-                await self._follow(decision)
+                decision = await self._decide(time.monotonic_ns())
+                await self._traffic.towards(decision.provoke)
+                if decision.record and decision.track is not None:
+                    await self._capture(decision.record, decision.track)
                 await self._decisions.flush()
         finally:
             await self._traffic.stop()
             await self._solver.close()
             await self._decisions.close()
 
-    def _decide(self, now_ns: int) -> Decision:
-        limits = self._settings.capture
+    async def _decide(self, now_ns: int) -> Decision:
         calibration = self._eyes.calibration
         calibrating = ""
         if calibration.status != "valid":
             calibrating = f"{calibration.percent} %, {calibration.reason}"
-        self._airtime.spend(now_ns, self._traffic.sent())
-        rate = self._settings.radio.traffic_packets_per_s
-        return self._schedule.decide(
-            now_ns,
-            [self._candidate(record, now_ns) for record in self._registry.all()],
-            View(calibrating, self._eyes.movers()),
-            airtime=self._airtime.allows(now_ns, rate, limits.max_s),
-        )
-
-    def _candidate(self, record: DeviceRecord, now_ns: int) -> Candidate:
-        address = self._registry.sends_as(record.mac)
-        heard = self._ears.heard_per_s(address, now_ns)
-        return Candidate(
-            record.mac,
-            record.name or record.mac,
-            record.state,
-            record.walks,
-            self._findings.doubted(record.mac),
-            heard,
-            self._traffic.reaches(record.mac),
-            "" if heard >= MIN_PACKETS_PER_S else self._ears.why_unheard(address, now_ns),
-            self._registry.wish(record.mac),
-        )
-
-    async def _follow(self, decision: Decision) -> None:
-        """Do what was decided, and say it."""
+        self._measuring.airtime.spend(now_ns, self._traffic.sent())
+        view = View(calibrating, self._eyes.movers())
+        decision = await self._measuring.decide(now_ns, view, partial(self._hearing, now_ns))
         self.step = decision.step
-        seeing = self._eyes.calibration.status == "valid"
-        self._decisions.tell(decision.step if seeing else NO_CALIBRATION)  # without its many percentages
-        for mac, reason in decision.waits.items():
-            record = self._registry.get(mac)
-            if record.state in _WAITING:
-                await self._registry.wait(mac, reason)
-            if seeing and reason != decision.step and not reason.endswith(self._registry.wish(mac)):
-                self._decisions.tell(f"{record.name or mac} waits: {reason}", mac)
-        await self._traffic.towards(decision.provoke)
-        if decision.record and decision.track is not None:
-            await self._capture(decision.record, decision.track)
+        return decision
+
+    def _hearing(self, now_ns: int, mac: str) -> Hearing:
+        address = self._registry.sends_as(mac)
+        per_s = self._ears.heard_per_s(address, now_ns)
+        why = "" if per_s >= MIN_PACKETS_PER_S else self._ears.why_unheard(address, now_ns)
+        return Hearing(per_s, self._traffic.reaches(mac), why)
 
     async def _capture(self, macs: tuple[str, ...], track: int) -> None:
-        before = [self._registry.get(mac) for mac in macs]
         try:
-            walk = await self._begin(before, track)
+            walk = await self._begin([self._registry.get(mac) for mac in macs], track)
         except OSError as error:
-            await self._void(macs, _unwritable(error), its_fault=False)
+            await self._measuring.void(time.monotonic_ns(), macs, _unwritable(error), its_fault=False)
             await self._keep_quota()
             await asyncio.sleep(UNWRITABLE_PAUSE_S)
             return
         unfinished = STOPPED
         try:
-            for record in before:
-                if record.state in _WAITING:  # one that is looked at again stays what it is meanwhile
-                    await self._registry.capturing(record.mac)
+            await self._measuring.capturing(macs)
             recorded = await walk.record(partial(self._say, walk))
             unfinished = ""
         except OSError as error:
@@ -195,19 +156,11 @@ class Captures:
             self._decisions.tell(f"{walk.seconds:.0f} s walked: {recorded.reason}")
             await self._solve(walk)
         else:
-            await self._void(macs, recorded.reason, its_fault=recorded.its_fault)
+            now_ns = time.monotonic_ns()
+            await self._measuring.void(now_ns, macs, recorded.reason, its_fault=recorded.its_fault)
             for mac in macs:
                 self._publish(walk, mac, "aborted", recorded.reason)
         await self._keep_quota()
-
-    async def _void(self, macs: Sequence[str], reason: str, *, its_fault: bool) -> None:
-        """A walk told nothing of these devices."""
-        for mac in macs:
-            self._schedule.failed(time.monotonic_ns(), mac, reason, its_fault=its_fault)
-            record = self._registry.get(mac)
-            self._decisions.tell(f"{record.name or mac}: the walk is void: {reason}", mac)
-            if record.state in _WAITING:
-                await self._registry.wait(mac, f"{reason}; {self._registry.wish(mac)}")
 
     async def _begin(self, records: list[DeviceRecord], track: int) -> WalkRecorder:
         now = datetime.now(UTC)
@@ -227,7 +180,7 @@ class Captures:
             self._eyes,
             self._ears,
             self._registry,
-            self._findings,
+            self._measuring.findings,
             self._solver,
             session=headers[0].id,
             macs=tuple(record.mac for record in records),
@@ -256,44 +209,29 @@ class Captures:
         self._say_solving(walk)
         told, useless = False, ""
         for mac, folder in zip(walk.macs, walk.writer.folders, strict=True):
-            self.step = f"working out where {self._registry.get(mac).name or mac} is"
+            self.step = f"working out where {self._measuring.name(mac)} is"
+            finding = None
             try:
                 solved = await self._solver.solve(folder)
-                reason, its_fault = self._useless(solved)
+                now_ns = time.monotonic_ns()
+                finding, reason = await self._measuring.take(now_ns, mac, solved, self._plan.epoch)
             except SessionError as error:
-                reason, its_fault = str(error), False
-            if not reason:
-                told = True
-                self._publish(walk, mac, "done", result=await self._take(mac, folder, solved))
+                reason = str(error)
+                await self._measuring.void(time.monotonic_ns(), (mac,), reason, its_fault=False)
+            if finding is None:
+                useless = useless or reason
+                await self._note(folder, CaptureResult(note=reason))
+                self._publish(walk, mac, "aborted", reason)
                 continue
-            useless = useless or reason
-            await self._void((mac,), reason, its_fault=its_fault)
-            await self._note(folder, CaptureResult(note=reason))
-            self._publish(walk, mac, "aborted", reason)
+            told = True
+            x_m, y_m = (float(v) for v in finding.place.xy_m)
+            radius_m = finding.place.radius90_m
+            await self._note(folder, CaptureResult(x_m, y_m, radius_m, finding.text))
+            self._publish(walk, mac, "done", result=m.CaptureResult(x_m=x_m, y_m=y_m, radius90_m=radius_m))
         if told:
             walk.wifi.solved()
         else:
             walk.wifi.abort(useless)
-
-    def _useless(self, solved: SolvedWalk) -> tuple[str, bool]:
-        """Why a solved walk tells nothing, and whether that is the device's fault; empty where it does."""
-        if solved.epoch != self._plan.epoch:
-            return "the robot's map changed during the walk", False
-        if solved.posterior is None or solved.status == "refused":
-            return solved.reason, solved.packets < MIN_PACKETS_PER_S * solved.walk_s
-        return "", False
-
-    async def _take(self, mac: str, folder: Path, solved: SolvedWalk) -> m.CaptureResult:
-        """The walk told something: the registry, the schedule, the log and the folder hear of it."""
-        finding = await self._findings.take(mac, solved)
-        blurred = self._registry.get(mac).state == "failed"
-        self._schedule.measured(time.monotonic_ns(), mac, blurred=blurred)
-        self._decisions.tell(finding.text, mac)
-        self._decisions.health.counters[finding.verdict.replace(" ", "_")] += 1
-        x_m, y_m = (float(v) for v in finding.place.xy_m)
-        radius_m = finding.place.radius90_m
-        await self._note(folder, CaptureResult(x_m, y_m, radius_m, finding.text))
-        return m.CaptureResult(x_m=x_m, y_m=y_m, radius90_m=radius_m)
 
     async def _note(self, folder: Path, result: CaptureResult) -> None:
         try:
@@ -329,7 +267,7 @@ class Captures:
             self._decisions.tell(f"{len(gone)} old sessions deleted to keep the quota, up to {gone[-1]}")
 
     def _say(self, walk: WalkRecorder) -> None:
-        names = ", ".join(self._registry.get(mac).name or mac for mac in walk.macs)
+        names = ", ".join(self._measuring.name(mac) for mac in walk.macs)
         self.step = f"recording a walk for {names}: {walk.seconds:.0f} s, {walk.writer.packets} packets"
         for mac in walk.macs:
             self._publish(walk, mac, walk.wifi.state, walk.wifi.reason)

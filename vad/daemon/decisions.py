@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -32,13 +33,17 @@ class Decision(msgspec.Struct, frozen=True):
 class DecisionLog:
     """Decisions in a file of one JSON object a line. `tell` on the loop, `flush` writes what was told.
 
+    Args:
+        folder: where the file is, or will be. wall: the wall time now, RFC 3339.
+
     Attributes:
         health: of the part `captures`: its detail is the last decision, its counters are what callers count.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, wall: Callable[[], str] = now_rfc3339) -> None:
         self.health = Health("captures")
         self._folder = folder
+        self._wall = wall
         self._waiting: list[Decision] = []
         self._last: dict[str | None, str] = {}
 
@@ -49,7 +54,7 @@ class DecisionLog:
         if len(self._last) > 4096:
             self._last.clear()
         self._last[mac] = text
-        self._waiting.append(Decision(now_rfc3339(), text, mac))
+        self._waiting.append(Decision(self._wall(), text, mac))
         self.health.detail = text
         _log.info("%s", text)
 

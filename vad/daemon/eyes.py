@@ -11,24 +11,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vad.camera.frame import Frame
+from vad.daemon.walkers import PeopleSeen, Walkers
 from vad.geometry import Intrinsics
 from vad.health import Health
 from vad.mapping.camera_calibration import CameraCalibration
 from vad.mapping.camera_stage import CameraMapper
+from vad.mapping.walk import WalkTrack
 from vad.robot.pose import RobotPose
 from vad.streams import DropOldestQueue
-from vad.vision.ground import GroundPoint, ground_point
-from vad.vision.people import MotionGate, PoseNetwork
+from vad.vision.movers import LoneMover
+from vad.vision.people import PoseNetwork
 from vad.vision.robot import RobotCandidate, RobotFinder
-from vad.vision.tracks import Track, Tracker, movers
 
 _log = logging.getLogger(__name__)
 
 SOLVE_EVERY_NS = 3_000_000_000
 ROBOT_MOVING_M = 0.03
-MIN_FRAMES = 20
-"""Fewer frames of a walker are no walk."""
-
 ROBOT_RESTS_AFTER_NS = 3_000_000_000
 
 
@@ -36,8 +34,7 @@ ROBOT_RESTS_AFTER_NS = 3_000_000_000
 class _Seen:
     """What one frame showed; made in a worker thread."""
 
-    grounds: list[GroundPoint]
-    people: int
+    people: PeopleSeen
     candidates: list[RobotCandidate]
 
 
@@ -67,14 +64,12 @@ class Eyes:
         self.frames = 0
         self.last_frame_ns = 0
         self.last_image: NDArray[np.uint8] | None = None
-        self._network = network
+        self._walkers = Walkers(network)
         self._focal_px = focal_px
         self._step_ns = int(0.9e9 / max_fps)
         self._on_calibration = on_calibration
-        self._gate = MotionGate()
         self._finder = RobotFinder()
         self._mapper: CameraMapper | None = None
-        self._tracker = Tracker()
         self._frame_listeners: list[Callable[[int], None]] = []
         self._poses: list[RobotPose] = []
         self._rest_xy = np.full(2, np.inf)
@@ -89,37 +84,34 @@ class Eyes:
 
     def others_moving(self, track_id: int, now_ns: int) -> int:
         """How many people besides this one move now."""
-        return sum(mover != track_id for mover in movers(self._tracker.tracks(), now_ns))
+        return sum(mover != track_id for mover in self._walkers.movers(now_ns))
 
     def movers(self) -> tuple[int, ...]:
         """The ids of all who move in the last frame."""
-        return tuple(movers(self._tracker.tracks(), self.last_frame_ns))
+        return self._walkers.movers(self.last_frame_ns)
+
+    def lone_mover(self) -> LoneMover | None:
+        """Who is most likely the one and only one who moves in the last frame, with its probability."""
+        return self._walkers.lone_mover(self.last_frame_ns)
 
     def place_of(self, track_id: int) -> tuple[float, float] | None:
         """Where this person was seen last, map frame; None for an unknown track."""
-        found = (t.xy_m[-1] for t in self._tracker.tracks() if t.id == track_id)
-        place = next(found, None)
-        return None if place is None else (float(place[0]), float(place[1]))
+        track = self._walkers.track(track_id)
+        return None if track is None else (float(track.xy_m[-1, 0]), float(track.xy_m[-1, 1]))
 
-    def track(self, track_id: int, from_ns: int, to_ns: int) -> Track | None:
-        """The track of one person within [from_ns, to_ns]; None when too short to be smoothed."""
-        for track in self._tracker.tracks():
-            if track.id == track_id:
-                inside = (track.t_ns >= from_ns) & (track.t_ns <= to_ns)
-                part = Track(
-                    track.id, track.t_ns[inside], track.xy_m[inside], track.covariance_m2[inside], True
-                )
-                return part if inside.sum() >= MIN_FRAMES else None
-        return None
+    async def walk(self, track_id: int, from_ns: int, to_ns: int) -> WalkTrack | None:
+        """The smoothed walk of one person within [from_ns, to_ns]; None when too short to be smoothed."""
+        return await self._walkers.walk(track_id, from_ns, to_ns, self.calibration)
 
     def seen_last_ns(self, track_id: int) -> int:
         """When this person was last seen; 0 for an unknown track."""
-        return next((int(t.t_ns[-1]) for t in self._tracker.tracks() if t.id == track_id), 0)
+        track = self._walkers.track(track_id)
+        return 0 if track is None else int(track.t_ns[-1])
 
     def begin_anew(self, calibration: CameraCalibration) -> None:
         """The map changed: go on from this calibration, with nothing of what was seen on the old map."""
         self._mapper = None
-        self._tracker = Tracker()
+        self._walkers.forget()
         self._poses.clear()
         self._take(calibration)
 
@@ -143,12 +135,13 @@ class Eyes:
 
     async def _look(self, frame: Frame) -> None:
         robot_moves = frame.t_ns - self._robot_moved_ns < ROBOT_RESTS_AFTER_NS
-        seen = await asyncio.to_thread(self._see, frame.image, robot_moves)
+        seen = await asyncio.to_thread(self._see, frame, robot_moves)
         self.frames += 1
         self.last_frame_ns = frame.t_ns
         self.last_image = frame.image
         self.health.counters["frames"] += 1
-        self.health.counters["people"] += seen.people
+        self.health.counters["people"] += len(seen.people.look.people)
+        self.health.counters["people without a place"] += len(seen.people.refused)
         mapper = self._mapper_for(frame.image)
         for pose in self._poses:
             mapper.add_pose(pose.t_ns, pose.x_m, pose.y_m, pose.sigma_m)
@@ -163,22 +156,17 @@ class Eyes:
             found = await asyncio.to_thread(mapper.solve)
             if mapper is self._mapper:  # else the map changed meanwhile
                 self._take_calibration(found)
-        if self.calibration.status == "valid":
-            self._track_people(frame.t_ns, seen.grounds)
+        self._walkers.take(frame.t_ns, seen.people)
         for listener in tuple(self._frame_listeners):
             listener(frame.t_ns)
-        self.health.ok(f"{seen.people} people in the last frame")
+        self.health.ok(str(seen.people))
 
-    def _see(self, image: NDArray[np.uint8], robot_moves: bool) -> _Seen:
-        people = self._network.infer(image) if self._gate.update(image) else []
-        height, width = image.shape[:2]
-        found = (ground_point(person, (width, height)) for person in people)
-        grounds = [ground for ground in found if isinstance(ground, GroundPoint)]
+    def _see(self, frame: Frame, robot_moves: bool) -> _Seen:
+        people = self._walkers.see(frame, self.calibration)
         candidates: list[RobotCandidate] = []
         if robot_moves:
-            boxes = np.array([p.box for p in people]).reshape(-1, 4)
-            candidates = self._finder.update(image, boxes)
-        return _Seen(grounds, len(people), candidates)
+            candidates = self._finder.update(frame.image, np.array(people.look.boxes).reshape(-1, 4))
+        return _Seen(people, candidates)
 
     def _mapper_for(self, image: NDArray[np.uint8]) -> CameraMapper:
         if self._mapper is None:
@@ -199,12 +187,3 @@ class Eyes:
     def _take(self, calibration: CameraCalibration) -> None:
         self.calibration = calibration
         self._on_calibration(calibration)
-
-    def _track_people(self, t_ns: int, grounds: list[GroundPoint]) -> None:
-        if not grounds:
-            self._tracker.update(t_ns, np.empty((0, 2)), np.empty((0, 2, 2)))
-            return
-        pixels = np.array([[g.x_px, g.y_px] for g in grounds])
-        spread = np.array([g.covariance_px2 for g in grounds])
-        xy_m, covariance = self.calibration.floor_points_with(pixels, spread)
-        self._tracker.update(t_ns, xy_m, covariance)

@@ -25,7 +25,7 @@ from vad.daemon.registry import Registry
 from vad.daemon.solver import Solver
 from vad.daemon.threads import to_the_end
 from vad.errors import SessionError
-from vad.vision.tracks import SmoothTrack, smooth
+from vad.mapping.walk import WalkTrack
 
 TICK_S = 0.1
 SAVE_WALK_NS = 2_000_000_000
@@ -123,7 +123,7 @@ class WalkRecorder:
         if self.wifi.state == "solving":
             walk = await self._walk(self.wifi.last_frame_ns)
             if walk is not None:
-                close = partial(self.writer.close, walk.t_ns, walk.xy_m, _sigma_m(walk), self.track)
+                close = partial(self.writer.close, walk.t_ns, walk.xy_m, walk.sigma_m, self.track)
                 await to_the_end(close)
                 return Recorded(True, self._judgement.reason)
             self.wifi.abort(TOO_FEW_FRAMES)
@@ -176,15 +176,14 @@ class WalkRecorder:
         if self._limits.keep_frames and image is not None and len(self._pictures) < PICTURES_AT_ONCE:
             self._pictures.append((t_ns, image))
 
-    async def _walk(self, to_ns: int | None) -> SmoothTrack | None:
+    async def _walk(self, to_ns: int | None) -> WalkTrack | None:
         """The walk so far; None where it is too short to be smoothed."""
         first_ns = self.wifi.first_frame_ns
         if first_ns is None or to_ns is None:
             return None
         if self._use_until_ns is not None:
             to_ns = min(to_ns, self._use_until_ns)
-        cut = self._eyes.track(self.track, first_ns, to_ns)
-        return None if cut is None else await asyncio.to_thread(smooth, cut)
+        return await self._eyes.walk(self.track, first_ns, to_ns)
 
     async def _save_walk(self) -> None:
         now_ns = time.monotonic_ns()
@@ -193,7 +192,7 @@ class WalkRecorder:
         self._saved_ns = now_ns
         walk = await self._walk(self._eyes.last_frame_ns)
         if walk is not None:
-            await to_the_end(partial(self.writer.walk, walk.t_ns, walk.xy_m, _sigma_m(walk), self.track))
+            await to_the_end(partial(self.writer.walk, walk.t_ns, walk.xy_m, walk.sigma_m, self.track))
 
     async def _save_pictures(self) -> None:
         if self._pictures:
@@ -222,8 +221,3 @@ def _write_pictures(writer: SessionWriter, pictures: list[tuple[int, NDArray[np.
         ok, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         if ok:
             writer.frame(t_ns, jpeg.tobytes())
-
-
-def _sigma_m(walk: SmoothTrack) -> NDArray[np.float64]:
-    """One standard deviation per axis from the covariances (M, 2, 2)."""
-    return np.asarray(np.sqrt(np.trace(walk.covariance_m2, axis1=1, axis2=2) / 2), dtype=np.float64)
