@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 import yaml
 from msgspec import Meta
 
 from vad.errors import ConfigError
+
+T = TypeVar("T")
 
 Positive = Annotated[float, Meta(gt=0)]
 Id = Annotated[str, Meta(pattern="^[A-Za-z0-9_-]{1,64}$")]
@@ -204,6 +206,12 @@ class BusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     pki: str | None = None
 
 
+class MetricsSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Prometheus metrics at http://127.0.0.1:<port>/metrics; left out: none."""
+
+    port: Annotated[int, Meta(ge=1, le=65535)] | None = None
+
+
 class CaptureSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """When a device counts as mapped, who is measured, how long a capture may be, what is kept.
 
@@ -254,12 +262,50 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     source: Literal["live", "simulated"] = "live"
     state_dir: str = "/var/lib/vad"
     bus: BusSettings = BusSettings()
+    metrics: MetricsSettings = MetricsSettings()
     capture: CaptureSettings = CaptureSettings()
     vision: VisionSettings = VisionSettings()
 
 
+class AgentSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """agent.yaml: a remote node with a CSI card, whose own place is wanted.
+
+    hub: the hub's endpoint, e.g. tls/192.168.1.10:7448; hub_name: its name in every key; credentials: the
+    folder that `vad pki issue agent ID` made there. id: this agent's; mac, interface: the card (the only
+    wireless one if both are left out). transmitter: the access point's address: frames known to be of others
+    are left out. batch_ms: packets of so long travel together; buffer_mb: what waits at most while the
+    network is gone.
+    """
+
+    hub: str
+    id: Id
+    hub_name: Id = "home"
+    credentials: str | None = None
+    name: Annotated[str, Meta(max_length=64)] | None = None
+    mac: MacText | None = None
+    interface: str | None = None
+    source: ConnectorCsi | FollowCsi = ConnectorCsi()
+    transmitter: MacText | None = None
+    carrier_hz: Positive = 5.24e9
+    bandwidth_mhz: Literal[20, 40] = 20
+    batch_ms: Annotated[float, Meta(ge=20, le=100)] = 50.0
+    buffer_mb: Annotated[float, Meta(ge=1, le=4096)] = 32.0
+
+
+def agent_settings(plain: dict[str, Any], *, where: str) -> AgentSettings:
+    """Plain values as AgentSettings; ConfigError names `where` and the key's path."""
+    return _typed(plain, AgentSettings, where)
+
+
 def parse_settings(text: str, *, where: str) -> Settings:
     """YAML text as Settings; ConfigError names `where` and the key's path."""
+    settings = _typed(parse_yaml(text, where=where), Settings, where)
+    _check_robot(settings, where)
+    return settings
+
+
+def parse_yaml(text: str, *, where: str) -> dict[str, Any]:
+    """YAML text as plain values; ConfigError where it is none."""
     try:
         raw: Any = yaml.safe_load(text)
     except yaml.YAMLError as error:
@@ -268,13 +314,15 @@ def parse_settings(text: str, *, where: str) -> Settings:
         raise ConfigError(f"not YAML{line}", where=where, remedy="Check the indentation") from error
     if not isinstance(raw, dict):
         raise ConfigError("the file holds no settings", where=where, remedy="See config/vad.yaml")
+    return raw
+
+
+def _typed(raw: dict[str, Any], kind: type[T], where: str) -> T:
     try:
-        settings = msgspec.convert(raw, type=Settings, strict=False)  # YAML 1.1 reads 5.24e9 as text
+        return msgspec.convert(raw, type=kind, strict=False)  # YAML 1.1 reads 5.24e9 as text
     except msgspec.ValidationError as error:
         what, _, path = str(error).partition(" - at ")
         raise ConfigError(what, where=f"{where}: {path.strip('`') or '$'}") from error
-    _check_robot(settings, where)
-    return settings
 
 
 def brings_map(robot: RobotSettings) -> bool:
@@ -301,15 +349,19 @@ def _check_robot(settings: Settings, where: str) -> None:
 
 def load_settings(path: Path) -> Settings:
     """Read and check a settings file; relative paths inside it are taken from its folder."""
+    return parse_settings(read_text(path), where=str(path))
+
+
+def read_text(path: Path) -> str:
+    """The text of a settings file; ConfigError where it cannot be read."""
     try:
-        text = path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8")
     except OSError as error:
         raise ConfigError(
             f"cannot be read ({error.strerror})", where=str(path), remedy="Give the file with --config"
         ) from error
     except UnicodeDecodeError as error:
         raise ConfigError("not UTF-8 text", where=str(path)) from error
-    return parse_settings(text, where=str(path))
 
 
 def pki_folder(settings: Settings, config_file: Path) -> Path:

@@ -1,6 +1,7 @@
 """What an agent and its hub say to each other, bytes <-> values; no I/O.
 
-The agent's stream (`csi`) is frames in sequence, MessagePack arrays; the hub's commands (`cmd`) are JSON.
+The agent's stream (`csi`) is frames in sequence, MessagePack arrays; the hub's commands (`cmd`) and its time
+(`clock`) are JSON.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from vad.mac import mac_from_text
 VERSION = 1
 FRAME_ENCODING = "application/x-msgpack;vad.csi.v1"
 COMMAND_ENCODING = "application/json;vad.cmd.v1"
+TIME_ENCODING = "application/json;vad.clock.v1"
 
 MAX_RAW_BYTES = 48 << 10
 """CSI bytes of a frame; zenoh sends up to 64 KiB in one piece, a fragment lost is a message lost."""
@@ -82,6 +84,13 @@ class Ack(msgspec.Struct, frozen=True, tag=True):
     next_seq: Natural
 
 
+class HubTime(msgspec.Struct, frozen=True):
+    """The hub's answer on `clock`. boot: names the timeline, which ends when the machine does."""
+
+    monotonic_ns: Natural
+    boot: Text
+
+
 Command = Start | Going | Stop | Abort | Ack
 
 _frames = msgspec.msgpack.Decoder(Frame)
@@ -122,3 +131,16 @@ def decode_command(payload: bytes) -> Command:
         return _commands.decode(payload)
     except msgspec.MsgspecError as error:
         raise ProtocolError(f"not a command ({error})") from error
+
+
+def encode_time(time: HubTime) -> bytes:
+    """JSON."""
+    return msgspec.json.encode(time)
+
+
+def decode_time(payload: bytes) -> HubTime:
+    """The inverse; ProtocolError for anything else."""
+    try:
+        return msgspec.json.decode(payload, type=HubTime)
+    except msgspec.MsgspecError as error:
+        raise ProtocolError(f"not a time ({error})") from error

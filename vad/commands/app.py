@@ -6,6 +6,7 @@ import typer
 
 from vad import __version__
 from vad.commands import loading
+from vad.commands.agent import agent
 from vad.commands.csi import csi_app
 from vad.commands.demo import demo
 from vad.commands.devices import devices
@@ -44,6 +45,7 @@ def _vad(
 
 app.command()(run)
 app.command("check-config")(check_config)
+app.command()(agent)
 app.command()(devices)
 app.add_typer(map_app, name="map")
 app.command()(status)

@@ -12,7 +12,7 @@ import sys
 from types import FrameType
 
 ENDINGS = (signal.SIGINT, signal.SIGTERM)
-RUN_UNTIL_ENDED = ("run", "sim")
+RUN_UNTIL_ENDED = ("run", "sim", "agent")
 """Commands whose proper end is a signal, at every moment; they take the signals over by themselves."""
 
 

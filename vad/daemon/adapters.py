@@ -16,7 +16,6 @@ from vad.camera.rtsp import RtspCamera
 from vad.camera.v4l2 import V4l2Camera, V4l2Settings
 from vad.config import (
     CameraSettings,
-    ConnectorCsi,
     DeviceSettings,
     FolderCameraSettings,
     Kinect2CameraSettings,
@@ -31,9 +30,7 @@ from vad.config import (
     ValetudoRobot,
     pki_folder,
 )
-from vad.csi.attribution import Attribution
-from vad.csi.connector import Connector
-from vad.csi.follow import FollowLog
+from vad.csi.open_source import open_source
 from vad.csi.packets import CsiSource
 from vad.devices.hostapd_source import HostapdSource
 from vad.devices.static_list import StaticList
@@ -109,11 +106,8 @@ def camera_source(settings: CameraSettings, base: Path) -> CameraSource:
 
 def csi_source(settings: RadioSettings, base: Path) -> CsiSource:
     """The CSI radio; relative paths are taken from `base`."""
-    source = settings.source
-    attribution = Attribution(None if settings.transmitter is None else mac_from_text(settings.transmitter))
-    if isinstance(source, ConnectorCsi):
-        return Connector(source.group, attribution=attribution, allow_user_space=source.allow_user_space)
-    return FollowLog(base / source.path, attribution=attribution)
+    transmitter = None if settings.transmitter is None else mac_from_text(settings.transmitter)
+    return open_source(settings.source, base, transmitter)
 
 
 def join_sources(settings: DeviceSettings, base: Path) -> list[JoinSource]:
