@@ -212,6 +212,12 @@ class MetricsSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     port: Annotated[int, Meta(ge=1, le=65535)] | None = None
 
 
+class MetricsSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Prometheus metrics at http://127.0.0.1:<port>/metrics; left out: none."""
+
+    port: Annotated[int, Meta(ge=1, le=65535)] | None = None
+
+
 class CaptureSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """When a device counts as mapped, who is measured, how long a capture may be, what is kept.
 
@@ -262,6 +268,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     source: Literal["live", "simulated"] = "live"
     state_dir: str = "/var/lib/vad"
     bus: BusSettings = BusSettings()
+    metrics: MetricsSettings = MetricsSettings()
     metrics: MetricsSettings = MetricsSettings()
     capture: CaptureSettings = CaptureSettings()
     vision: VisionSettings = VisionSettings()

@@ -166,9 +166,10 @@ class HeatmapMessage(Message, frozen=True, kw_only=True):
 
 
 class Latency(msgspec.Struct, frozen=True, kw_only=True):
-    """How long one kind of work took: `count` times in all; median, 99th percentile and longest of late."""
+    """How long one kind of work took: `count` times, `total_s` since the start; the rest of late."""
 
     count: int
+    total_s: float
     p50_ms: float
     p99_ms: float
     max_ms: float

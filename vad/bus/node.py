@@ -12,6 +12,7 @@ import asyncio
 import logging
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
@@ -144,6 +145,17 @@ class Bus:
     def ask_past(self, past: Past | None) -> None:
         """From now on questions about the past (`?at=`, history) go to `past`."""
         self._past = past
+
+    @property
+    def status(self) -> m.StatusMessage | None:
+        """The status that was published last."""
+        entry = self._board.tables[self.keys.status].get(self.keys.status)
+        return None if entry is None else m.decode(entry.form.payload, m.StatusMessage)
+
+    def device_states(self) -> Counter[str]:
+        """How many devices are in which state."""
+        devices = self._board.tables[self.keys.device()].values()
+        return Counter(entry.facts.state for entry in devices if entry.facts is not None)
 
     def publish_status(self, message: m.StatusMessage) -> None:
         """Replace the status; a put only where more than the uptime changed."""

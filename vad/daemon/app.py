@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
+from collections.abc import Coroutine
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -25,8 +26,11 @@ from vad.daemon.captures import Captures
 from vad.daemon.checks import check_listen
 from vad.daemon.ears import Ears
 from vad.daemon.eyes import Eyes
-from vad.daemon.floor import Change, FloorKeeper, first_plan, follow_plans
+from vad.daemon.floor import SAY_WAITING_S, Change, FloorKeeper, first_plan, follow_plans
+from vad.daemon.metrics import MetricsServer, StatusCollector
 from vad.daemon.notify import notify
+from vad.daemon.parts import Parts
+from vad.daemon.past import StoredPast
 from vad.daemon.registry import Registry
 from vad.devices.station import StationEvent
 from vad.errors import VadError
@@ -45,6 +49,8 @@ _log = logging.getLogger(__name__)
 
 STATUS_EVERY_S = 0.5
 
+T = TypeVar("T")
+
 
 async def run_daemon(settings: Settings, config_file: Path) -> None:
     """Run until cancelled; VadError where something without which nothing works is missing or breaks."""
@@ -59,7 +65,10 @@ async def run_daemon(settings: Settings, config_file: Path) -> None:
     state_dir = resolve(settings.state_dir, config_file)
     store = StoreWorker(state_dir / "vad.sqlite")
     listen = local_endpoints(settings.bus.listen)
-    bus = Bus(NodeSettings(hub=settings.hub, listen=listen, connect=settings.bus.connect))
+    bus = Bus(
+        NodeSettings(hub=settings.hub, listen=listen, connect=settings.bus.connect), source=settings.source
+    )
+    bus.ask_past(StoredPast(store, settings.source))
     await store.open()
     try:
         await bus.open()
@@ -95,6 +104,7 @@ class Daemon:
         self._store = store
         self._gate = network_gate(settings, config_file)
         self._started = time.monotonic()
+        self._parts = Parts()
         self._calibrations: DropOldestQueue[CameraCalibration] = DropOldestQueue(1)
 
     async def run(self) -> None:
@@ -125,7 +135,7 @@ class Daemon:
         keeper = FloorKeeper(self._state_dir / "plans", rooms)
         self._plan, changed = await first_plan(keeper, self._plan_of_file, robot, self._say_waiting)
         robot.epoch = self._plan.epoch
-        known = await self._known_camera()
+        known = await self._patiently(self._known_camera(), robot)
         eyes = Eyes(
             self._network,
             max_fps=settings.vision.max_fps,
@@ -135,7 +145,7 @@ class Daemon:
         )
         ears = Ears()
         registry = Registry(settings, self._plan, self._bus, self._store)
-        await registry.load()
+        await self._patiently(registry.load(), robot)
         captures = Captures(settings, self._state_dir, self._plan, eyes, ears, registry, self._bus)
         self._publish_map()
         self._publish_camera(eyes.calibration)
@@ -165,8 +175,14 @@ class Daemon:
             csi.health,
             *captures.parts,
             self._bus.health,
+            self._store.health,
             *([self._gate.health] if self._gate is not None else []),
         ]
+        if settings.metrics.port is not None:
+            collector = StatusCollector(lambda: self._bus.status, self._bus.device_states)
+            metrics = MetricsServer(settings.metrics.port, collector)
+            group.create_task(metrics.run(), name="metrics")
+            parts.append(metrics.health)
         queues: dict[str, DropOldestQueue[Any]] = {"poses": poses, "frames": frames, "csi": batches}
         group.create_task(
             self._tell_status([*parts, *(s.health for s in joins)], queues, captures), name="status"
@@ -188,17 +204,32 @@ class Daemon:
                 eyes.begin_anew(moved_calibration(eyes.calibration, change.transform))
         self._publish_map()
 
-    def _say_waiting(self, robot: PoseSource) -> None:
-        """The status while there is no floor plan yet: nothing else can begin."""
-        step = "waiting for the robot's map"
+    def _say_waiting(self, robot: PoseSource, step: str = "waiting for the robot's map") -> None:
+        """The status while nothing else can begin: there is no floor plan, or the disk takes nothing."""
         notify(f"READY=1\nSTATUS={step}")
+        healths = [robot.health, self._bus.health, self._store.health]
+        self._publish_status(step, self._parts.tell(healths, time.monotonic()))
+
+    async def _patiently(self, work: Coroutine[Any, Any, T], robot: PoseSource) -> T:
+        """Wait for `work` at the store; where the disk is full that is said, and who asks is answered."""
+        task = asyncio.create_task(work, name="store at start")
+        try:
+            while not (await asyncio.wait({task}, timeout=SAY_WAITING_S))[0]:
+                self._say_waiting(robot, f"waiting for the store: {self._store.health.detail}")
+            return task.result()
+        finally:
+            if not task.done():
+                task.cancel()
+                await asyncio.wait({task})
+
+    def _publish_status(self, step: str, parts: tuple[m.Part, ...]) -> None:
         self._bus.publish_status(
             m.StatusMessage(
                 source=self._settings.source,
                 version=__version__,
                 uptime_s=round(time.monotonic() - self._started, 1),
                 step=step,
-                parts=(_part(robot.health), _part(self._bus.health)),
+                parts=parts,
             )
         )
 
@@ -232,23 +263,19 @@ class Daemon:
     ) -> None:
         """Publish the status until cancelled."""
         said = ""
+        daemon = Health("daemon")
         while True:
-            dropped = {f"dropped_{name}": queue.dropped for name, queue in queues.items()}
-            daemon = m.Part(part="daemon", state="ok", detail=captures.step, counters=dropped)
-            self._bus.publish_status(
-                m.StatusMessage(
-                    source=self._settings.source,
-                    version=__version__,
-                    uptime_s=round(time.monotonic() - self._started, 1),
-                    step=captures.step,
-                    parts=(daemon, *(_part(health) for health in parts)),
-                )
-            )
+            daemon.ok(captures.step)
+            for name, queue in queues.items():
+                daemon.counters |= {name: queue.accepted, f"dropped_{name}": queue.dropped}
+            self._publish_status(captures.step, self._parts.tell([daemon, *parts], time.monotonic()))
             if captures.step != said:
                 said = captures.step
                 notify(f"STATUS={said}")
                 _log.info("%s", said)
+            slept_s = time.monotonic()
             await asyncio.sleep(STATUS_EVERY_S)
+            daemon.took("loop_lag", max(0.0, time.monotonic() - slept_s - STATUS_EVERY_S))
 
     def _publish_map(self) -> None:
         plan = self._plan
@@ -302,16 +329,6 @@ async def _register(stations: DropOldestQueue[StationEvent], registry: Registry)
         event = await stations.get()
         if event.kind == "joined":
             await registry.joined(event.mac, event.name)
-
-
-def _part(health: Health) -> m.Part:
-    return m.Part(
-        part=health.part,
-        state=health.state,
-        detail=health.detail,
-        last_error=health.last_error,
-        counters=dict(health.counters),
-    )
 
 
 def _matrix3(matrix: np.ndarray[Any, np.dtype[np.float64]] | None) -> m.Matrix3 | None:
