@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vad.geometry import FloatArray
-from vad.sim.render_person import Clothes, person_parts
+from vad.sim.render_person import Build, Clothes, person_parts
 from vad.sim.render_robot import robot_parts
 from vad.sim.render_room import draw_room
 from vad.sim.render_shapes import Image, Part, Patch, View, draw_parts, draw_shadow
@@ -22,8 +22,8 @@ _FLICKER = 0.006
 class Renderer:
     """Draws frames of one scenario. A frame depends on its time alone, not on the frames before it."""
 
-    def __init__(self, scenario: Scenario, *, seed: int = 0) -> None:
-        """seed: of paint, clothes and noise; the room's geometry is the scenario's."""
+    def __init__(self, scenario: Scenario, *, seed: int = 0, build: Build | None = None) -> None:
+        """seed: of paint, clothes and noise; build: the walker's; the room's geometry is the scenario's."""
         self.view = View.of(scenario.camera)
         self._scenario = scenario
         self._seed = seed
@@ -32,6 +32,7 @@ class Renderer:
         self._background = room.image
         self._covers = [_trim(cover) for cover in room.covers]
         self._clothes = Clothes.draw(rng)
+        self._build = build
         height, width = self._background.shape[:2]
         shape = (height + _NOISE_MARGIN_PX, width + _NOISE_MARGIN_PX, 3)
         noise = rng.normal(0.0, _NOISE_LEVELS, shape).astype(np.float32)
@@ -52,7 +53,7 @@ class Renderer:
                 parts = robot_parts(x, y, yaw)
                 draw_shadow(image, self.view, (x, y), ROBOT_RADIUS_M * 1.25, 0.5)
             else:
-                parts = person_parts(who, self._clothes)
+                parts = person_parts(who, self._clothes, self._build)
                 self._person_shadow(image, parts, place)
             draw_parts(image, self.view, parts)
             self._put_furniture_before(image, place)

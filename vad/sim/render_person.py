@@ -55,6 +55,28 @@ class Clothes:
 
 
 @dataclass(frozen=True, slots=True)
+class Build:
+    """How one person differs from the mean: heights as fractions of the stature; how far they lean ahead."""
+
+    hip: float = _HIP
+    shoulder: float = _SHOULDER
+    lean_rad: float = 0.0
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator) -> Build:
+        """Somebody's build."""
+        return cls(
+            hip=float(_HIP + 0.012 * rng.standard_normal()),
+            shoulder=float(_SHOULDER + 0.010 * rng.standard_normal()),
+            lean_rad=float(rng.normal(0.03, 0.03)),
+        )
+
+    def up(self, fraction: float) -> float:
+        """The height of a point of the trunk or head, which is at `fraction` in the mean."""
+        return float(np.interp(fraction, [0.0, _HIP, _SHOULDER, 1.0], [0.0, self.hip, self.shoulder, 1.0]))
+
+
+@dataclass(frozen=True, slots=True)
 class Foot:
     """An ankle in the body's frame (ahead, left, up; metres) and the foot's pitch, toes down positive."""
 
@@ -85,8 +107,9 @@ def foot_at(cycle: float, side: float, height_m: float) -> Foot:
     return Foot(ankle, float(pitch))
 
 
-def person_parts(walker: WalkerState, clothes: Clothes) -> list[Part]:
-    """The parts of a person, in the map."""
+def person_parts(walker: WalkerState, clothes: Clothes, build: Build | None = None) -> list[Part]:
+    """The parts of a person, in the map; of the mean build if none is given."""
+    build = build or Build()
     h = walker.height_m
     cycle = walker.phase_rad / (2 * np.pi)
     c, s = np.cos(walker.heading_rad), np.sin(walker.heading_rad)
@@ -101,13 +124,15 @@ def person_parts(walker: WalkerState, clothes: Clothes) -> list[Part]:
 
     def at(ahead: float, left: float, up: float) -> FloatArray:
         """A point of the trunk from fractions of the stature."""
-        return np.asarray(np.array([ahead, left, up]) * h + sway, dtype=np.float64)
+        height = build.up(up)
+        ahead += (height - build.hip) * np.tan(build.lean_rad)
+        return np.asarray(np.array([ahead, left, height]) * h + sway, dtype=np.float64)
 
     parts: list[Part] = []
     for side in (1.0, -1.0):
         foot = foot_at((cycle + (0.0 if side > 0 else 0.5)) % 1.0, side, h)
         hip = at(0.012 * side * swing, 0.05 * side, _HIP)
-        knee = _knee(hip, foot.ankle_m, (_HIP - _KNEE) * h, (_KNEE - _ANKLE) * h)
+        knee = _knee(hip, foot.ankle_m, (build.hip - build.up(_KNEE)) * h, (build.up(_KNEE) - _ANKLE) * h)
         parts += [
             part([*_shoe(foot, h)], [0.042, 0.036, 0.03], clothes.shoes),
             part([knee, foot.ankle_m], [0.06, 0.043], clothes.trousers),

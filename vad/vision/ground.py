@@ -63,16 +63,13 @@ def ground_point(person: Person, image_size: tuple[int, int]) -> GroundPoint | R
 
     One hidden ankle makes the covariance larger: its place is the network's guess, or it is left out.
     """
-    width, height = image_size
-    margin = _EDGE_SHARE * height
-    if person.box[3] > height - margin:
-        return Refusal("feet cut off by the picture's lower edge")
+    cut = feet_cut(person, image_size)
+    if cut is not None:
+        return cut
     ankles = person.keypoints[[LEFT_ANKLE, RIGHT_ANKLE]]
     seen = ankles[ankles[:, 2] >= ANKLE_SCORE_MIN]
     if len(seen) == 0:
         return Refusal("no ankle seen")
-    if seen[:, 0].min() < margin or seen[:, 0].max() > width - margin:
-        return Refusal("feet cut off by the picture's side")
     size_px = person.box[3] - person.box[1]
     if size_px <= 0 or person.box[3] <= seen[:, 1].max() - 0.5 * size_px:
         return Refusal("box and ankles disagree")
@@ -91,6 +88,19 @@ def ground_point(person: Person, image_size: tuple[int, int]) -> GroundPoint | R
     covariance = np.diag([(sigma_x * size_px) ** 2, (sigma_y * size_px) ** 2]) + np.eye(2) * _SIGMA_PX**2
     x, y = middle + offset
     return GroundPoint(float(x), float(y), covariance, len(seen))
+
+
+def feet_cut(person: Person, image_size: tuple[int, int]) -> Refusal | None:
+    """Why a person's feet are not in a picture of `image_size`, (width, height) px; None if they are."""
+    width, height = image_size
+    margin = _EDGE_SHARE * height
+    if person.box[3] > height - margin:
+        return Refusal("feet cut off by the picture's lower edge")
+    ankles = person.keypoints[[LEFT_ANKLE, RIGHT_ANKLE]]
+    seen_x = ankles[ankles[:, 2] >= ANKLE_SCORE_MIN, 0]
+    if len(seen_x) and (seen_x.min() < margin or seen_x.max() > width - margin):
+        return Refusal("feet cut off by the picture's side")
+    return None
 
 
 def _body_offset(person: Person, ankle_px: FloatArray) -> FloatArray | None:
