@@ -64,7 +64,8 @@ class HubLink:
         while True:
             try:
                 async with self._opened() as session:
-                    self._trouble(f"connected to {where}, but no hub named {self._bus.hub!r} is there yet")
+                    # Said only where it lasts: a hub that is there shows itself at once.
+                    self.health.trouble(f"connected to {where}, but no hub {self._bus.hub!r} is there yet")
                     await self._linked(session)
             except (VadError, zenoh.ZError) as error:
                 self._trouble(str(error))

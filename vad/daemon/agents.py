@@ -172,13 +172,7 @@ class Agents:
         def on_clock(query: zenoh.Query) -> None:
             with query, contextlib.suppress(zenoh.ZError):
                 payload = encode_time(HubTime(time.monotonic_ns(), boot))
-                query.reply(
-                    query.key_expr,
-                    payload,
-                    encoding=TIME_ENCODING,
-                    priority=zenoh.Priority.REAL_TIME,
-                    express=True,
-                )
+                query.reply(query.key_expr, payload, encoding=TIME_ENCODING, express=True)
 
         self._session, self._out = session, out
         # indirect=False: no Python thread of its own

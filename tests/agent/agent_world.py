@@ -1,0 +1,118 @@
+"""What the tests of the agent share: a hub's router with its agents' side, an agent on a FIFO, a card."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+import time
+from collections.abc import AsyncIterator, Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import zenoh
+
+from vad.agent.info import AgentInfo
+from vad.agent.node import Node
+from vad.bus.keys import HubKeys
+from vad.bus.session import BusSettings, open_session
+from vad.csi.bfee import encode_bodies
+from vad.csi.follow import FollowLog
+from vad.csi.logfile import record
+from vad.daemon.agents import AgentBatch, Agents
+from vad.sim.driver import FifoSender
+from vad.streams import DropOldestQueue
+
+HUB = "home"
+MAC = "00:16:ea:00:00:01"
+KEYS = HubKeys(HUB)
+BFEE = 0xBB
+
+
+def free_port() -> int:
+    """A TCP port of the loopback interface where nobody listens."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+async def until(condition: Callable[[], bool], what: str, timeout_s: float = 15.0) -> None:
+    """Wait until the condition holds."""
+    try:
+        async with asyncio.timeout(timeout_s):
+            while not condition():  # noqa: ASYNC110 - what is waited for has no event
+                await asyncio.sleep(0.01)
+    except TimeoutError:
+        raise AssertionError(f"not in {timeout_s:.0f} s: {what}") from None
+
+
+class Card:
+    """A 5300's driver that writes into a FIFO: 3x2 packets, numbered by their bfee_count."""
+
+    def __init__(self, path: Path) -> None:
+        self.sent = 0
+        self._sender = FifoSender(path)
+
+    def send(self, n: int) -> None:
+        """The next n packets, which came in the last n times 0.2 ms."""
+        count = np.arange(self.sent, self.sent + n)
+        csi = np.ones((n, 30, 3, 2, 2), np.int8)
+        nic_us = time.monotonic_ns() // 1000 - 200 * np.arange(n)[::-1]
+        bodies = encode_bodies(csi, nic_us=nic_us, bfee_count=count, rssi=(30, 31, 32))
+        before = self._sender.health.counters["records"]
+        self._sender.send([record(BFEE, body) for body in bodies])
+        assert self._sender.health.counters["records"] - before == n, "the FIFO has a reader that keeps up"
+        self.sent += n
+
+    def close(self) -> None:
+        """Take the FIFO away."""
+        self._sender.close()
+
+
+@contextlib.contextmanager
+def router(port: int) -> Iterator[zenoh.Session]:
+    """The hub's router with its token."""
+    settings = BusSettings(hub=HUB, listen=(f"tcp/127.0.0.1:{port}",))
+    with open_session(settings) as session:
+        token = session.liveliness().declare_token(KEYS.alive)
+        yield session
+        del token
+
+
+@contextlib.asynccontextmanager
+async def hearing(
+    session: zenoh.Session, queued: int = 10_000
+) -> AsyncIterator[tuple[Agents, DropOldestQueue[AgentBatch]]]:
+    """The hub's side while it runs, and what comes in."""
+    agents = Agents(KEYS)
+    out: DropOldestQueue[AgentBatch] = DropOldestQueue(queued)
+    task = asyncio.create_task(agents.run(session, out))
+    try:
+        yield agents, out
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+
+@contextlib.asynccontextmanager
+async def running_node(
+    port: int, fifo: Path, *, name: str = "attic", mac: str = MAC, buffer_bytes: int = 32_000_000
+) -> AsyncIterator[Node]:
+    """An agent in this process."""
+    node = Node(
+        BusSettings(hub=HUB, mode="client", listen=(), connect=(f"tcp/127.0.0.1:{port}",)),
+        AgentInfo(id=name, mac=mac),
+        FollowLog(fifo),
+        batch_s=0.03,
+        buffer_bytes=buffer_bytes,
+    )
+    task = asyncio.create_task(node.run())
+    try:
+        if fifo.exists():  # noqa: ASYNC240 - of this machine
+            await until(lambda: node.collector.source.state == "ok", "the agent reads")
+        yield node
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task

@@ -1,0 +1,196 @@
+"""An agent and its hub over a real router in one process: the stream, the clock, the handshake, breaks."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import numpy as np
+import pytest
+from agent_world import KEYS, MAC, Card, free_port, hearing, router, running_node, until
+from bad_network import BadNetwork
+
+from vad.agent.info import decode_info
+from vad.capture.handshake import Abort, Going, Start, Started, Stop, Stopped
+from vad.daemon.agents import AgentBatch, Line
+from vad.mac import mac_from_text
+
+SECOND_NS = 1_000_000_000
+
+
+def numbers_of(batches: list[AgentBatch]) -> list[int]:
+    """The numbers of all packets."""
+    return np.concatenate([b.batch.packets.bfee_count for b in batches]).tolist() if batches else []
+
+
+async def answered(line: Line, kind: type) -> Started | Stopped | Abort:
+    """The next answer, which must be of this kind."""
+    answers: list[Started | Stopped | Abort] = []
+
+    def come() -> bool:
+        answers.extend(line.heard())
+        return bool(answers)
+
+    await until(come, f"an answer of the agent ({kind.__name__})")
+    assert isinstance(answers[0], kind), answers
+    return answers[0]
+
+
+async def test_what_the_card_hears_arrives_at_the_hub_in_its_time(tmp_path: Path) -> None:
+    port, card = free_port(), Card(tmp_path / "csi.fifo")
+    with router(port) as session:
+        async with hearing(session) as (agents, out), running_node(port, tmp_path / "csi.fifo") as node:
+            for _ in range(10):
+                card.send(20)
+                await asyncio.sleep(0.02)
+            await until(lambda: agents.health.counters["packets"] == 200, "all packets")
+            batches = out.drain()
+            assert numbers_of(batches) == list(range(200))
+            packets = batches[0].batch.packets
+            assert (packets.mac == mac_from_text(MAC)).all()
+            assert packets.csi.shape[1:] == (30, 3, 2)
+            assert batches[0].agent == "attic"
+            assert node.collector.clock.known
+            (reply,) = session.get(KEYS.agent_alive("attic"), timeout=5.0)
+            assert decode_info(reply.ok.payload.to_bytes()).mac == MAC
+            tokens = list(session.liveliness().get(KEYS.agent_alive(), timeout=5.0))
+            assert [str(t.ok.key_expr) for t in tokens] == [KEYS.agent_alive("attic")]
+            card_seen = agents.card_of(MAC)
+            assert card_seen is not None
+            assert card_seen.clock_error_ns < SECOND_NS / 100
+            assert agents.health.state == "ok"
+    card.close()
+
+
+async def test_a_session_is_acknowledged_with_clock_and_first_packet(tmp_path: Path) -> None:
+    port, card = free_port(), Card(tmp_path / "csi.fifo")
+    with router(port) as session:
+        async with hearing(session) as (agents, out), running_node(port, tmp_path / "csi.fifo"):
+            card.send(1)
+            await until(lambda: agents.card_of(MAC) is not None, "the agent is there")
+            remote = agents.card_of(MAC)
+            assert remote is not None
+            with agents.leading(remote, "s") as line:
+                line.say([Start("s", 0)])
+                for _ in range(8):
+                    await asyncio.sleep(0.05)
+                    card.send(20)
+                started = await answered(line, Started)
+                assert isinstance(started, Started)
+                times = np.concatenate([b.batch.packets.arrival_ns for b in out.drain()])
+                assert started.first_frame_ns in times.tolist()
+                line.say([Going("s"), Going("s")])
+                again = await answered(line, Started)
+                assert isinstance(again, Started)
+                assert again.first_frame_ns == started.first_frame_ns
+                line.heard()
+                line.say([Stop("s")])
+                stopped = await answered(line, Stopped)
+                assert isinstance(stopped, Stopped)
+                assert 0 < stopped.frames <= card.sent
+                assert stopped.first_frame_ns == started.first_frame_ns
+                assert stopped.last_frame_ns > started.first_frame_ns
+                line.say([Start("s", 0), Stop("s")])
+                assert await answered(line, Stopped) == stopped, "an ended session does not begin again"
+                assert line.lost == 0
+    card.close()
+
+
+async def test_a_recording_that_the_hub_knows_nothing_of_is_ended(tmp_path: Path) -> None:
+    port, card = free_port(), Card(tmp_path / "csi.fifo")
+    with router(port) as session:
+        async with hearing(session) as (agents, _), running_node(port, tmp_path / "csi.fifo") as node:
+            card.send(1)
+            await until(lambda: agents.card_of(MAC) is not None, "the agent is there")
+            agents.command("attic", Start("lost", 0))
+            await until(lambda: node.collector.recording, "it has begun")
+            await asyncio.sleep(0.05)
+            card.send(40)
+            await until(lambda: not node.collector.recording, "the hub calls it off", 2.0)
+    card.close()
+
+
+async def test_a_card_that_cannot_be_read_is_told_with_its_reason(tmp_path: Path) -> None:
+    port = free_port()
+    with router(port) as session:
+        async with hearing(session) as (agents, _), running_node(port, tmp_path / "none.fifo"):
+            await until(lambda: agents.card_of(MAC) is not None, "the agent is there")
+            remote = agents.card_of(MAC)
+            assert remote is not None
+            await until(lambda: "none.fifo" in remote.trouble, "the reason")
+            await until(lambda: "attic: Cannot read" in agents.health.detail, "it shows in the status")
+            with agents.leading(remote, "s") as line:
+                line.say([Start("s", 0)])
+                told = await answered(line, Abort)
+                assert isinstance(told, Abort)
+                assert "Cannot read the CSI log" in told.reason
+
+
+async def test_nothing_is_lost_through_a_short_break(tmp_path: Path) -> None:
+    port, card = free_port(), Card(tmp_path / "csi.fifo")
+    network = BadNetwork(port, share=0.0)
+    with router(port) as session:
+        async with (
+            network.running(),
+            hearing(session) as (agents, out),
+            running_node(network.port, tmp_path / "csi.fifo") as node,
+        ):
+            for step in range(60):
+                card.send(20)
+                await asyncio.sleep(0.02)
+                if step == 20:
+                    network.cut()
+                elif step == 40:
+                    network.mend()
+            await until(lambda: agents.health.counters["packets"] == card.sent, "all packets")
+            assert numbers_of(out.drain()) == list(range(card.sent))
+            assert agents.health.counters["lost"] == 0
+            assert node.link.health.counters["met"] >= 2
+            assert node.collector.health.counters["dropped_packets"] == 0
+    card.close()
+
+
+@pytest.mark.slow
+async def test_what_a_small_buffer_dropped_in_a_break_is_counted_exactly(tmp_path: Path) -> None:
+    port, card = free_port(), Card(tmp_path / "csi.fifo")
+    network = BadNetwork(port, share=0.0)
+    with router(port) as session:
+        async with (
+            network.running(),
+            hearing(session) as (agents, out),
+            running_node(network.port, tmp_path / "csi.fifo", buffer_bytes=100_000) as node,
+        ):
+            for step in range(80):
+                card.send(20)
+                await asyncio.sleep(0.02)
+                if step == 10:
+                    network.cut()
+                elif step == 70:
+                    network.mend()
+            counters = agents.health.counters
+            await until(lambda: counters["packets"] + counters["lost"] == card.sent, "an exact count")
+            batches = out.drain()
+            arrived = numbers_of(batches)
+            assert counters["lost"] > 500
+            assert sum(batch.lost for batch in batches) == counters["lost"]
+            assert sorted(set(arrived)) == arrived
+            assert len(arrived) == counters["packets"]
+            assert counters["lost"] <= node.collector.outbox.dropped_packets
+    card.close()
+
+
+async def test_an_agent_starts_before_its_hub_and_outlives_it(tmp_path: Path) -> None:
+    port, card = free_port(), Card(tmp_path / "csi.fifo")
+    async with running_node(port, tmp_path / "csi.fifo") as node:
+        card.send(20)
+        await until(lambda: node.link.health.state == "degraded", "it says that there is no hub")
+        for _ in range(2):
+            with router(port) as session:
+                async with hearing(session) as (agents, _):
+                    before = card.sent
+                    await until(lambda: agents.card_of(MAC) is not None, "the agent is there")
+                    card.send(20)
+                    await until(lambda: agents.health.counters["packets"] >= 20, "CSI")
+                    assert agents.health.counters["packets"] <= card.sent
+                    assert before < card.sent
+    card.close()
