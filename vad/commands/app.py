@@ -16,6 +16,7 @@ from vad.commands.pki import app as pki_app
 from vad.commands.replay import replay
 from vad.commands.robot import app as robot_app
 from vad.commands.run import check_config, run
+from vad.commands.sessions import sessions_app
 from vad.commands.sim import sim
 from vad.commands.status import status
 
@@ -50,6 +51,7 @@ app.command()(devices)
 app.add_typer(map_app, name="map")
 app.command()(status)
 app.command()(replay)
+app.add_typer(sessions_app, name="sessions")
 app.command()(demo)
 app.command()(sim)
 app.command()(doctor)

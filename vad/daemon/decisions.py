@@ -47,9 +47,9 @@ class DecisionLog:
         self._waiting: list[Decision] = []
         self._last: dict[str | None, str] = {}
 
-    def tell(self, text: str, mac: str | None = None) -> None:
-        """A decision; the same one again (of the same device) is not told twice in a row."""
-        if self._last.get(mac) == text:
+    def tell(self, text: str, mac: str | None = None, *, lasts: bool = False) -> None:
+        """A decision, or what came of one. lasts: it holds on and is not told twice in a row, of a device."""
+        if lasts and self._last.get(mac) == text:
             return
         if len(self._last) > 4096:
             self._last.clear()

@@ -74,14 +74,15 @@ class Measuring:
             view,
             airtime=self.airtime.allows(now_ns, self._provoked_per_s, self._limits.max_s),
         )
-        self._log.tell(NO_CALIBRATION if view.calibrating else decision.step)  # without its percentages
+        step = NO_CALIBRATION if view.calibrating else decision.step  # without its many percentages
+        self._log.tell(step, lasts=not decision.record)
         for mac, reason in decision.waits.items():
             record = self._registry.get(mac)
             if record.state in _WAITING:
                 await self._registry.wait(mac, reason)
             common = reason in (decision.step, NO_CALIBRATION) or reason.endswith(self._registry.wish(mac))
             if not common:
-                self._log.tell(f"{self.name(mac)} waits: {reason}", mac)
+                self._log.tell(f"{self.name(mac)} waits: {reason}", mac, lasts=True)
         return decision
 
     async def capturing(self, macs: Sequence[str]) -> None:

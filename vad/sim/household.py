@@ -5,18 +5,36 @@ Everything follows from the seed. Times are seconds since the first midnight (`t
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vad.csi.attribution import Attribution
+from vad.csi.logfile import LogReader
+from vad.csi.packets import CsiBatch
+from vad.mac import mac_from_text
 from vad.robot.floor_plan import FloorPlan, Room
 from vad.sim.home import floor_plan
+from vad.sim.radio import Radio, RadioBatch
 from vad.sim.scenario import Scenario, Walk, make_home
 
 FloatArray = NDArray[np.float64]
 
 DAY_S = 86_400.0
+_PACKET = (
+    "t_s",
+    "csi",
+    "rssi",
+    "noise_dbm",
+    "agc",
+    "antenna_sel",
+    "rate",
+    "bfee_count",
+    "nic_us",
+    "mac",
+)
 _NAMES = (
     "lamp",
     "tv",
@@ -193,3 +211,36 @@ def _visits(home: Scenario, days: int, rng: np.random.Generator) -> tuple[Visit,
                 after_s = float(rng.choice([0.0, 9.0])) if along else 0.0
                 visits.append(Visit(walk, who, along, after_s))
     return tuple(sorted(visits, key=lambda visit: visit.walk.start_s))
+
+
+def hear(
+    household: Household, visit: Visit, rates: Mapping[str, float], from_s: float, to_s: float
+) -> CsiBatch:
+    """What the hub's card gives from from_s to to_s of the visit, of all the named devices together.
+
+    rates: MAC -> packets per second. Arrivals are on the household's timeline, in ns.
+    """
+    parts, radio = [], None
+    for device in household.devices:
+        if device.mac not in rates:
+            continue
+        number = int(device.mac[-2:], 16)
+        radio = Radio(
+            household.scenario_of(device, visit),
+            packets_per_s=rates[device.mac],
+            seed=household.home.seed * 100 + number,
+        )
+        heard = radio.generate(from_s, to_s)
+        mine = np.flatnonzero(heard.mac == mac_from_text(device.mac))
+        parts.append({name: getattr(heard, name)[mine] for name in _PACKET})
+    assert radio is not None, "nobody is heard"
+    joined = {name: np.concatenate([part[name] for part in parts]) for name in _PACKET}
+    order = np.argsort(joined["t_s"], kind="stable")
+    packets = {name: values[order] for name, values in joined.items()}
+    # One card hears them all: one clock, one count.
+    packets["nic_us"] = (np.rint(packets["t_s"] * 1e6).astype(np.int64) & 0xFFFF_FFFF).astype(np.uint32)
+    packets["bfee_count"] = (np.arange(len(order)) & 0xFFFF).astype(np.uint16)
+    batch = RadioBatch(**packets, legacy_t_s=np.empty(0), legacy_frames=())
+    read = LogReader(Attribution()).feed(b"".join(data for _, data in radio.log_bytes(batch)))
+    arrival_ns = np.rint(batch.t_s * 1e9).astype(np.int64)
+    return replace(read, packets=replace(read.packets, arrival_ns=arrival_ns))
