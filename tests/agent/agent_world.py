@@ -19,9 +19,8 @@ from vad.bus.session import BusSettings, open_session
 from vad.csi.bfee import encode_bodies
 from vad.csi.follow import FollowLog
 from vad.csi.logfile import record
-from vad.daemon.agents import AgentBatch, Agents
+from vad.daemon.agents import Agents, RemoteCard
 from vad.sim.driver import FifoSender
-from vad.streams import DropOldestQueue
 
 HUB = "home"
 MAC = "00:16:ea:00:00:01"
@@ -80,19 +79,24 @@ def router(port: int) -> Iterator[zenoh.Session]:
 
 
 @contextlib.asynccontextmanager
-async def hearing(
-    session: zenoh.Session, queued: int = 10_000
-) -> AsyncIterator[tuple[Agents, DropOldestQueue[AgentBatch]]]:
-    """The hub's side while it runs, and what comes in."""
+async def hearing(session: zenoh.Session) -> AsyncIterator[Agents]:
+    """The hub's side while it runs."""
     agents = Agents(KEYS)
-    out: DropOldestQueue[AgentBatch] = DropOldestQueue(queued)
-    task = asyncio.create_task(agents.run(session, out))
+    task = asyncio.create_task(agents.run(session))
     try:
-        yield agents, out
+        yield agents
     finally:
         task.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await task
+
+
+async def there(agents: Agents, mac: str = MAC) -> RemoteCard:
+    """The agent's card, once the hub has heard of it."""
+    await until(lambda: agents.card_of(mac) is not None, f"an agent with the card {mac}")
+    card = agents.card_of(mac)
+    assert card is not None
+    return card
 
 
 @contextlib.asynccontextmanager

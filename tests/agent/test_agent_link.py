@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from agent_world import KEYS, MAC, Card, free_port, hearing, router, running_node, until
+from agent_world import KEYS, MAC, Card, free_port, hearing, router, running_node, there, until
 from bad_network import BadNetwork
 
+from vad.agent.frames import MAX_FRAME_BYTES
 from vad.agent.info import decode_info
 from vad.capture.handshake import Abort, Going, Start, Started, Stop, Stopped
-from vad.daemon.agents import AgentBatch, Line
+from vad.csi.packets import CsiBatch
+from vad.daemon.agents import Line
 from vad.mac import mac_from_text
 
 SECOND_NS = 1_000_000_000
 
 
-def numbers_of(batches: list[AgentBatch]) -> list[int]:
+def numbers_of(batches: list[CsiBatch]) -> list[int]:
     """The numbers of all packets."""
-    return np.concatenate([b.batch.packets.bfee_count for b in batches]).tolist() if batches else []
+    return np.concatenate([b.packets.bfee_count for b in batches]).tolist() if batches else []
 
 
 async def answered(line: Line, kind: type) -> Started | Stopped | Abort:
@@ -36,48 +39,49 @@ async def answered(line: Line, kind: type) -> Started | Stopped | Abort:
     return answers[0]
 
 
+async def send(card: Card, times: int, n: int = 20) -> None:
+    """n packets every 20 ms."""
+    for _ in range(times):
+        card.send(n)
+        await asyncio.sleep(0.02)
+
+
 async def test_what_the_card_hears_arrives_at_the_hub_in_its_time(tmp_path: Path) -> None:
     port, card = free_port(), Card(tmp_path / "csi.fifo")
     with router(port) as session:
-        async with hearing(session) as (agents, out), running_node(port, tmp_path / "csi.fifo") as node:
-            for _ in range(10):
-                card.send(20)
-                await asyncio.sleep(0.02)
-            await until(lambda: agents.health.counters["packets"] == 200, "all packets")
-            batches = out.drain()
+        async with hearing(session) as agents, running_node(port, tmp_path / "csi.fifo"):
+            remote = await there(agents)
+            with agents.leading(remote, "s") as line:
+                await send(card, 10)
+                await until(lambda: agents.health.counters["packets"] == 200, "all packets")
+                batches = line.batches()
             assert numbers_of(batches) == list(range(200))
-            packets = batches[0].batch.packets
+            packets = batches[0].packets
             assert (packets.mac == mac_from_text(MAC)).all()
             assert packets.csi.shape[1:] == (30, 3, 2)
-            assert batches[0].agent == "attic"
-            assert node.collector.clock.known
+            assert remote.id == "attic"
+            assert remote.heard_per_s(time.monotonic_ns()) == 100.0
+            assert remote.clock_error_ns < SECOND_NS / 100
+            assert agents.health.state == "ok"
             (reply,) = session.get(KEYS.agent_alive("attic"), timeout=5.0)
             assert decode_info(reply.ok.payload.to_bytes()).mac == MAC
             tokens = list(session.liveliness().get(KEYS.agent_alive(), timeout=5.0))
             assert [str(t.ok.key_expr) for t in tokens] == [KEYS.agent_alive("attic")]
-            card_seen = agents.card_of(MAC)
-            assert card_seen is not None
-            assert card_seen.clock_error_ns < SECOND_NS / 100
-            assert agents.health.state == "ok"
     card.close()
 
 
 async def test_a_session_is_acknowledged_with_clock_and_first_packet(tmp_path: Path) -> None:
     port, card = free_port(), Card(tmp_path / "csi.fifo")
     with router(port) as session:
-        async with hearing(session) as (agents, out), running_node(port, tmp_path / "csi.fifo"):
-            card.send(1)
-            await until(lambda: agents.card_of(MAC) is not None, "the agent is there")
-            remote = agents.card_of(MAC)
-            assert remote is not None
+        async with hearing(session) as agents, running_node(port, tmp_path / "csi.fifo"):
+            remote = await there(agents)
             with agents.leading(remote, "s") as line:
                 line.say([Start("s", 0)])
-                for _ in range(8):
-                    await asyncio.sleep(0.05)
-                    card.send(20)
+                await until(lambda: agents.health.counters["packets"] == 0, "nothing yet")
+                await send(card, 20)
                 started = await answered(line, Started)
                 assert isinstance(started, Started)
-                times = np.concatenate([b.batch.packets.arrival_ns for b in out.drain()])
+                times = np.concatenate([b.packets.arrival_ns for b in line.batches()])
                 assert started.first_frame_ns in times.tolist()
                 line.say([Going("s"), Going("s")])
                 again = await answered(line, Started)
@@ -92,20 +96,18 @@ async def test_a_session_is_acknowledged_with_clock_and_first_packet(tmp_path: P
                 assert stopped.last_frame_ns > started.first_frame_ns
                 line.say([Start("s", 0), Stop("s")])
                 assert await answered(line, Stopped) == stopped, "an ended session does not begin again"
-                assert line.lost == 0
+                assert line.lost() == 0
     card.close()
 
 
 async def test_a_recording_that_the_hub_knows_nothing_of_is_ended(tmp_path: Path) -> None:
     port, card = free_port(), Card(tmp_path / "csi.fifo")
     with router(port) as session:
-        async with hearing(session) as (agents, _), running_node(port, tmp_path / "csi.fifo") as node:
-            card.send(1)
-            await until(lambda: agents.card_of(MAC) is not None, "the agent is there")
+        async with hearing(session) as agents, running_node(port, tmp_path / "csi.fifo") as node:
+            await there(agents)
             agents.command("attic", Start("lost", 0))
             await until(lambda: node.collector.recording, "it has begun")
-            await asyncio.sleep(0.05)
-            card.send(40)
+            await send(card, 5)
             await until(lambda: not node.collector.recording, "the hub calls it off", 2.0)
     card.close()
 
@@ -113,10 +115,8 @@ async def test_a_recording_that_the_hub_knows_nothing_of_is_ended(tmp_path: Path
 async def test_a_card_that_cannot_be_read_is_told_with_its_reason(tmp_path: Path) -> None:
     port = free_port()
     with router(port) as session:
-        async with hearing(session) as (agents, _), running_node(port, tmp_path / "none.fifo"):
-            await until(lambda: agents.card_of(MAC) is not None, "the agent is there")
-            remote = agents.card_of(MAC)
-            assert remote is not None
+        async with hearing(session) as agents, running_node(port, tmp_path / "none.fifo"):
+            remote = await there(agents)
             await until(lambda: "none.fifo" in remote.trouble, "the reason")
             await until(lambda: "attic: Cannot read" in agents.health.detail, "it shows in the status")
             with agents.leading(remote, "s") as line:
@@ -132,19 +132,19 @@ async def test_nothing_is_lost_through_a_short_break(tmp_path: Path) -> None:
     with router(port) as session:
         async with (
             network.running(),
-            hearing(session) as (agents, out),
+            hearing(session) as agents,
             running_node(network.port, tmp_path / "csi.fifo") as node,
         ):
-            for step in range(60):
-                card.send(20)
-                await asyncio.sleep(0.02)
-                if step == 20:
-                    network.cut()
-                elif step == 40:
-                    network.mend()
-            await until(lambda: agents.health.counters["packets"] == card.sent, "all packets")
-            assert numbers_of(out.drain()) == list(range(card.sent))
-            assert agents.health.counters["lost"] == 0
+            remote = await there(agents)
+            with agents.leading(remote, "s") as line:
+                await send(card, 20)
+                network.cut()
+                await send(card, 20)
+                network.mend()
+                await send(card, 20)
+                await until(lambda: agents.health.counters["packets"] == card.sent, "all packets")
+                assert numbers_of(line.batches()) == list(range(card.sent))
+                assert line.lost() == 0
             assert node.link.health.counters["met"] >= 2
             assert node.collector.health.counters["dropped_packets"] == 0
     card.close()
@@ -157,22 +157,20 @@ async def test_what_a_small_buffer_dropped_in_a_break_is_counted_exactly(tmp_pat
     with router(port) as session:
         async with (
             network.running(),
-            hearing(session) as (agents, out),
+            hearing(session) as agents,
             running_node(network.port, tmp_path / "csi.fifo", buffer_bytes=100_000) as node,
         ):
-            for step in range(80):
-                card.send(20)
-                await asyncio.sleep(0.02)
-                if step == 10:
-                    network.cut()
-                elif step == 70:
-                    network.mend()
+            remote = await there(agents)
             counters = agents.health.counters
-            await until(lambda: counters["packets"] + counters["lost"] == card.sent, "an exact count")
-            batches = out.drain()
-            arrived = numbers_of(batches)
-            assert counters["lost"] > 500
-            assert sum(batch.lost for batch in batches) == counters["lost"]
+            with agents.leading(remote, "s") as line:
+                await send(card, 10)
+                network.cut()
+                await send(card, 60)
+                network.mend()
+                await send(card, 10)
+                await until(lambda: counters["packets"] + counters["lost"] == card.sent, "an exact count")
+                arrived = numbers_of(line.batches())
+                assert line.lost() == counters["lost"] > 500
             assert sorted(set(arrived)) == arrived
             assert len(arrived) == counters["packets"]
             assert counters["lost"] <= node.collector.outbox.dropped_packets
@@ -186,11 +184,36 @@ async def test_an_agent_starts_before_its_hub_and_outlives_it(tmp_path: Path) ->
         await until(lambda: node.link.health.state == "degraded", "it says that there is no hub")
         for _ in range(2):
             with router(port) as session:
-                async with hearing(session) as (agents, _):
-                    before = card.sent
-                    await until(lambda: agents.card_of(MAC) is not None, "the agent is there")
+                async with hearing(session) as agents:
+                    await there(agents)
                     card.send(20)
                     await until(lambda: agents.health.counters["packets"] >= 20, "CSI")
                     assert agents.health.counters["packets"] <= card.sent
-                    assert before < card.sent
+                    assert agents.health.counters["lost"] == 0
+    card.close()
+
+
+async def test_two_agents_cannot_have_one_card(tmp_path: Path) -> None:
+    port = free_port()
+    with router(port) as session:
+        async with hearing(session) as agents, running_node(port, tmp_path / "none.fifo"):
+            await there(agents)
+            async with running_node(port, tmp_path / "none.fifo", name="thief"):
+                await until(lambda: agents.health.counters["strangers"] > 0, "the second one is refused")
+                assert (await there(agents)).id == "attic"
+
+
+async def test_garbage_on_an_agents_key_is_counted_and_harms_nobody(tmp_path: Path) -> None:
+    port, card = free_port(), Card(tmp_path / "csi.fifo")
+    with router(port) as session:
+        async with hearing(session) as agents, running_node(port, tmp_path / "csi.fifo") as node:
+            await there(agents)
+            for payload in (b"", b"garbage", bytes(MAX_FRAME_BYTES + 1)):
+                session.put(KEYS.agent_csi("attic"), payload)
+            session.put(KEYS.agent_cmd("attic"), b"garbage")
+            counters = agents.health.counters
+            await until(lambda: counters["bad_frames"] == 2 and counters["too_big"] == 1, "all are counted")
+            await until(lambda: node.link.health.counters["bad_commands"] == 1, "and the agent's")
+            await send(card, 2)
+            await until(lambda: counters["packets"] == 40, "CSI goes on")
     card.close()

@@ -49,6 +49,7 @@ class SessionWriter:
         self._headers = {folder: header} | {folder.parent / twin.id: twin for twin in twins}
         self._heard = dict.fromkeys(self._headers, 0)
         self._walk_s = 0.0
+        self._lost = 0
         self._frames = 0
         self._linked = True
         for made in self._headers:
@@ -88,6 +89,10 @@ class SessionWriter:
             mac = header.device.mac
             mine = len(arrivals) if mac is None else (batch.packets.mac == mac_from_text(mac)).sum()
             self._heard[folder] += int(mine)
+
+    def lost(self, packets: int) -> None:
+        """So many packets were given up on their way here: the folder says so."""
+        self._lost += packets
 
     def walk(self, t_ns: NDArray[np.int64], xy_m: FloatArray, sigma_m: FloatArray, track: int) -> None:
         """Write the walker so far: (M,), (M, 2), (M,); the next call replaces it."""
@@ -158,6 +163,8 @@ class SessionWriter:
     def _write_headers(self, state: str, reason: str) -> None:
         for folder, header in self._headers.items():
             capture = {"packets": self._heard[folder], "walk_s": round(self._walk_s, 1)}
+            if self._lost:
+                capture["lost_packets"] = self._lost
             write_header(folder, msgspec.to_builtins(header), {"state": state, "reason": reason, **capture})
 
 

@@ -6,11 +6,11 @@ import asyncio
 import contextlib
 import logging
 import time
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import zenoh
@@ -41,6 +41,9 @@ from vad.streams import DropOldestQueue
 log = logging.getLogger(__name__)
 
 MAX_AGENTS = 32
+HEARD_OVER_NS = 2_000_000_000
+QUEUED_BATCHES = 4096
+"""Minutes of a session's batches: what a disk may hold up without a loss."""
 ACK_S = 0.1
 """Confirmations are collected for this long: an agent may have seconds of frames under way."""
 SILENT_NS = 10_000_000_000
@@ -50,15 +53,6 @@ PAST_NS = 900_000_000_000
 """Packets from outside of this span have a wrong clock; an agent's buffer holds minutes."""
 FRAMES = Intake(max_bytes=MAX_FRAME_BYTES, per_s=2000.0, burst=1000, waiting=512)
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
-
-
-class AgentBatch(NamedTuple):
-    """CSI of one agent. batch: mac is the agent's own, arrival_ns on the hub's timeline; lost: packets that
-    were given up right before this batch."""
-
-    agent: str
-    batch: CsiBatch
-    lost: int
 
 
 @dataclass(slots=True)
@@ -72,6 +66,7 @@ class RemoteCard:
         clock_error_ns: how wrong its times can be.
         trouble: why it has no CSI, as it says.
         inbox: its stream, with counters.
+        recent: times and numbers of packets.
     """
 
     id: str
@@ -83,6 +78,11 @@ class RemoteCard:
     trouble: str = ""
     inbox: Inbox = field(default_factory=Inbox)
     reader: LogReader = field(default_factory=LogReader)
+    recent: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=400))
+
+    def heard_per_s(self, now_ns: int) -> float:
+        """Packets per second over the last two seconds."""
+        return sum(n for t_ns, n in self.recent if now_ns - t_ns <= HEARD_OVER_NS) / (HEARD_OVER_NS / 1e9)
 
     def there(self, now_ns: int) -> bool:
         """Whether it has been heard of late."""
@@ -96,12 +96,17 @@ class Line:
         self.card = card
         self._agents = agents
         self._answers: list[Answer] = []
-        self._lost_before = card.inbox.lost
+        self._batches: DropOldestQueue[CsiBatch] = DropOldestQueue(QUEUED_BATCHES)
+        self._lost = 0
 
-    @property
+    def batches(self) -> list[CsiBatch]:
+        """What has come since the last call, in order; arrival_ns on the hub's timeline, mac the agent's."""
+        return self._batches.drain()
+
     def lost(self) -> int:
-        """Packets given up since the line was opened."""
-        return self.card.inbox.lost - self._lost_before
+        """Packets given up on their way since the last call."""
+        lost, self._lost = self._lost, 0
+        return lost
 
     def say(self, messages: Sequence[Message]) -> None:
         """Send the leader's messages; what gets lost is said again by the leader."""
@@ -112,6 +117,12 @@ class Line:
         """What the agent answered since the last call, in order, each after the packets before it."""
         answers, self._answers = self._answers, []
         return answers
+
+    def take(self, batch: CsiBatch | None, lost: int) -> None:
+        """Keep packets for `batches`, and how many are missing before them."""
+        self._lost += lost
+        if batch is not None:
+            self._batches.put(batch)
 
     def answer(self, answer: Answer) -> None:
         """Keep an answer for `heard`."""
@@ -126,10 +137,9 @@ class Agents:
     """
 
     def __init__(self, keys: HubKeys) -> None:
-        self.health = Health("agents")
+        self.health = Health("csi.agents")
         self._keys = keys
         self._session: zenoh.Session | None = None
-        self._out: DropOldestQueue[AgentBatch] | None = None
         self._cards: dict[str, RemoteCard] = {}
         self._lines: dict[tuple[str, str], Line] = {}
         self._ack_timers: dict[str, asyncio.TimerHandle] = {}
@@ -149,7 +159,7 @@ class Agents:
         finally:
             del self._lines[card.id, session]
 
-    async def run(self, session: zenoh.Session, out: DropOldestQueue[AgentBatch]) -> None:
+    async def run(self, session: zenoh.Session) -> None:
         """Take what agents send until cancelled; the session stays the caller's."""
         loop = asyncio.get_running_loop()
         boot = (await asyncio.to_thread(BOOT_ID.read_text)).strip()
@@ -174,7 +184,7 @@ class Agents:
                 payload = encode_time(HubTime(time.monotonic_ns(), boot))
                 query.reply(query.key_expr, payload, encoding=TIME_ENCODING, express=True)
 
-        self._session, self._out = session, out
+        self._session = session
         # indirect=False: no Python thread of its own
         frames = session.declare_subscriber(
             self._keys.agent_csi(), handlers.Callback(on_frame, indirect=False)
@@ -187,7 +197,7 @@ class Agents:
                 self._tell(time.monotonic_ns())
                 await asyncio.sleep(1.0)
         finally:
-            self._session = self._out = None
+            self._session = None
             for timer in self._ack_timers.values():
                 timer.cancel()
             self._ack_timers.clear()
@@ -237,13 +247,16 @@ class Agents:
         lost = card.inbox.lost - before
         counters["lost"] += lost
         batch = self._batch(card, frame, arrival_ns)
-        if batch is not None and self._out is not None:
+        if batch is not None:
             counters["packets"] += frame.packets
-            self._out.put(AgentBatch(agent, batch, lost))
+            card.recent.append((int(batch.packets.arrival_ns[-1]), frame.packets))
+        for (its, _), line in self._lines.items():
+            if its == agent:
+                line.take(batch, lost)
         for answer in frame.answers:
-            line = self._lines.get((agent, answer.session))
-            if line is not None:
-                line.answer(answer)
+            asked = self._lines.get((agent, answer.session))
+            if asked is not None:
+                asked.answer(answer)
                 continue
             for message in no_such_session(answer):
                 self.command(agent, message)

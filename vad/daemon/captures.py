@@ -26,8 +26,9 @@ from vad.capture.session import (
     SessionMap,
     SessionRadio,
 )
-from vad.capture.session_writer import SessionWriter
+from vad.capture.walk_writer import OWN_CARD, WalkWriter
 from vad.config import Settings
+from vad.daemon.agents import Agents, RemoteCard
 from vad.daemon.decisions import DecisionLog
 from vad.daemon.ears import Ears
 from vad.daemon.eyes import Eyes
@@ -62,6 +63,7 @@ class Captures:
         ears: Ears,
         registry: Registry,
         bus: Bus,
+        agents: Agents | None = None,
     ) -> None:
         self.step = "starting"
         self._settings = settings
@@ -70,6 +72,7 @@ class Captures:
         self._ears = ears
         self._registry = registry
         self._bus = bus
+        self._agents = agents or Agents(bus.keys)
         self._archive = state_dir / "sessions"
         self._decisions = DecisionLog(state_dir)
         self._traffic = Traffic(settings.radio.traffic_packets_per_s, registry.ip_of)
@@ -124,6 +127,9 @@ class Captures:
 
     def _hearing(self, now_ns: int, mac: str) -> Hearing:
         address = self._registry.sends_as(mac)
+        card = self._agents.card_of(address)
+        if card is not None:
+            return Hearing(card.heard_per_s(now_ns), self._traffic.reaches(mac), card.trouble)
         per_s = self._ears.heard_per_s(address, now_ns)
         why = "" if per_s >= MIN_PACKETS_PER_S else self._ears.why_unheard(address, now_ns)
         return Hearing(per_s, self._traffic.reaches(mac), why)
@@ -152,6 +158,9 @@ class Captures:
             await self._traffic.stop()
         if unfinished:
             recorded = Recorded(False, unfinished)
+        for agent, lost in walk.lost.items():
+            if lost:
+                self._decisions.tell(f"agent {agent}: {lost} packets of this walk never came: the network")
         if recorded.complete:
             self._decisions.tell(f"{walk.seconds:.0f} s walked: {recorded.reason}")
             await self._solve(walk)
@@ -164,10 +173,14 @@ class Captures:
 
     async def _begin(self, records: list[DeviceRecord], track: int) -> WalkRecorder:
         now = datetime.now(UTC)
-        headers = [self._header(now, record) for record in records]
-        opening = asyncio.get_running_loop().run_in_executor(
-            None, SessionWriter, self._archive / headers[0].id, headers[0], headers[1:]
-        )
+        cards: dict[str, RemoteCard] = {}
+        sessions: list[tuple[str, SessionHeader]] = []
+        for record in records:
+            card = self._agents.card_of(self._registry.sends_as(record.mac))
+            if card is not None:
+                cards[record.mac] = card
+            sessions.append((OWN_CARD if card is None else card.id, self._header(now, record, card)))
+        opening = asyncio.get_running_loop().run_in_executor(None, WalkWriter, self._archive, sessions)
         try:
             writer = await asyncio.shield(opening)
         except asyncio.CancelledError:
@@ -182,25 +195,30 @@ class Captures:
             self._registry,
             self._measuring.findings,
             self._solver,
-            session=headers[0].id,
+            self._agents,
+            session=sessions[0][1].id,
             macs=tuple(record.mac for record in records),
+            cards=cards,
             track=track,
             writer=writer,
         )
 
-    def _header(self, now: datetime, record: DeviceRecord) -> SessionHeader:
+    def _header(self, now: datetime, record: DeviceRecord, card: RemoteCard | None) -> SessionHeader:
         position = self._eyes.calibration.position_m
         assert position is not None  # only a valid calibration gets here
         radio = self._settings.radio
         anchor = position + np.array(radio.antenna_offset_m)
         address = self._registry.sends_as(record.mac)
+        heard = SessionRadio("intel5300", radio.carrier_hz, radio.bandwidth_mhz, "anchor")
+        if card is not None:  # the antennas are the device's, the anchor's end sends
+            heard = SessionRadio("intel5300", card.carrier_hz, card.bandwidth_mhz, "device")
         return SessionHeader(
             schema=SCHEMA,
             id=session_id(now, address),
             source=self._settings.source,
             device=SessionDevice(address, record.name),
             anchor=SessionAnchor(float(anchor[0]), float(anchor[1]), float(anchor[2])),
-            radio=SessionRadio("intel5300", radio.carrier_hz, radio.bandwidth_mhz, "anchor"),
+            radio=heard,
             map=SessionMap(self._plan.epoch, self._plan.bounds_m),
         )
 

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from vad.capture.session_writer import SessionWriter
+from vad.capture.walk_writer import WalkWriter
 from vad.csi.heard import HeardStations
 from vad.csi.packets import CsiBatch
 from vad.daemon.threads import to_the_end
@@ -52,7 +52,7 @@ class Ears:
         """Keep no more; what waits is dropped."""
         self._recording = None
 
-    async def drain(self, writer: SessionWriter) -> None:
+    async def drain(self, writer: WalkWriter) -> None:
         """Write what was recorded since the last call."""
         if self._recording:
             waiting, self._recording = self._recording, []
@@ -75,6 +75,6 @@ class Ears:
             del self._heard[oldest]
 
 
-def _write(writer: SessionWriter, batches: list[CsiBatch]) -> None:
+def _write(writer: WalkWriter, batches: list[CsiBatch]) -> None:
     for batch in batches:
         writer.append(batch)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -16,8 +17,10 @@ from numpy.typing import NDArray
 from vad.capture.enough import GONE_S, LATE_S, Ground, Judgement, Progress, judge
 from vad.capture.handshake import CameraSide, Message, WifiSide
 from vad.capture.schedule import MIN_PACKETS_PER_S
-from vad.capture.session_writer import SessionWriter
+from vad.capture.walk_writer import WalkWriter
 from vad.config import CaptureSettings
+from vad.csi.packets import CsiBatch
+from vad.daemon.agents import Agents, Line, RemoteCard
 from vad.daemon.ears import Ears
 from vad.daemon.eyes import Eyes
 from vad.daemon.findings import Findings
@@ -55,11 +58,13 @@ class WalkRecorder:
 
     Args:
         macs: the devices, as the registry names them; in the order of the writer's folders.
+        cards: those of them that are remote cards, by their agent.
         track: the walker.
         session: the handshake's id.
 
     Attributes:
         wifi: the handshake's leading side; its state is the session's.
+        lost: packets of remote cards that were given up on their way, by agent.
     """
 
     def __init__(
@@ -70,13 +75,16 @@ class WalkRecorder:
         registry: Registry,
         findings: Findings,
         solver: Solver,
+        agents: Agents,
         *,
         session: str,
         macs: tuple[str, ...],
+        cards: Mapping[str, RemoteCard],
         track: int,
-        writer: SessionWriter,
+        writer: WalkWriter,
     ) -> None:
-        self.wifi = WifiSide(session)
+        self.wifi = WifiSide(session, tuple(card.id for card in cards.values()))
+        self.lost: Counter[str] = Counter()
         self.macs = macs
         self.track = track
         self.writer = writer
@@ -87,6 +95,9 @@ class WalkRecorder:
         self._registry = registry
         self._findings = findings
         self._solver = solver
+        self._agents = agents
+        self._cards = cards
+        self._lines: list[Line] = []
         self._ground = Ground()
         self._begun_ns = self._heard_ns = self._saved_ns = time.monotonic_ns()
         self._use_until_ns: int | None = None
@@ -105,17 +116,22 @@ class WalkRecorder:
         self._ears.start_recording()
         forget = self._eyes.listen(self._frame_seen)
         looking = asyncio.create_task(self._look_ahead(), name="look ahead")
+        lines = contextlib.ExitStack()
         try:
-            self._to_camera(self.wifi.arm(time.monotonic_ns()))
+            for card in self._cards.values():
+                self._lines.append(lines.enter_context(self._agents.leading(card, self.wifi.session)))
+            self._say(self.wifi.arm(time.monotonic_ns()))
             while self.wifi.state in ("armed", "recording", "stopping"):
                 await asyncio.sleep(TICK_S)
                 self._exchange()
                 await self._ears.drain(self.writer)
+                await self._save_remote()
                 await self._save_pictures()
                 await self._save_walk()
                 on_progress()
         finally:
             forget()
+            lines.close()
             self._ears.stop_recording()
             looking.cancel()
             with contextlib.suppress(asyncio.CancelledError):
@@ -135,23 +151,26 @@ class WalkRecorder:
         now_ns = time.monotonic_ns()
         arrived, self._to_wifi = self._to_wifi, []
         for message in arrived:
-            self._to_camera(self.wifi.receive(message, now_ns))
-        self._to_camera(self.wifi.tick(now_ns))
+            self._say(self.wifi.receive(message, now_ns))
+        for line in self._lines:
+            for answer in line.heard():
+                self._say(self.wifi.receive(answer, now_ns, line.card.id))
+        self._say(self.wifi.tick(now_ns))
         self._to_wifi += self._camera.tick(now_ns)
         if self.wifi.state != "recording":
             return
         progress = self._progress(now_ns)
         self._judgement = judge(progress, min_s=self._limits.min_s, max_s=self._limits.max_s)
         if self._judgement.act == "abort":
-            self._to_camera(self.wifi.abort(self._judgement.reason))
+            self._say(self.wifi.abort(self._judgement.reason))
         elif self._judgement.act == "finish":
             if not progress.alone:
                 self._use_until_ns = self._eyes.last_frame_ns - int(LATE_S * 1e9)
-            self._to_camera(self.wifi.finish(now_ns))
+            self._say(self.wifi.finish(now_ns))
 
     def _progress(self, now_ns: int) -> Progress:
         frame_ns = self._eyes.last_frame_ns
-        heard = [self._ears.heard_per_s(self._registry.sends_as(mac), now_ns) for mac in self.macs]
+        heard = [self._heard_per_s(mac, now_ns) for mac in self.macs]
         if max(heard) >= MIN_PACKETS_PER_S:
             self._heard_ns = now_ns
         place = self._eyes.place_of(self.track)
@@ -166,9 +185,25 @@ class WalkRecorder:
             self._ground.covered(frame_ns),
         )
 
-    def _to_camera(self, messages: list[Message]) -> None:
+    def _heard_per_s(self, mac: str, now_ns: int) -> float:
+        card = self._cards.get(mac)
+        if card is not None:
+            return card.heard_per_s(now_ns)
+        return self._ears.heard_per_s(self._registry.sends_as(mac), now_ns)
+
+    def _say(self, messages: list[Message]) -> None:
+        """To the camera and to every remote card."""
         for message in messages:
             self._to_wifi += self._camera.receive(message, time.monotonic_ns())
+        for line in self._lines:
+            line.say(messages)
+
+    async def _save_remote(self) -> None:
+        for line in self._lines:
+            batches, lost = line.batches(), line.lost()
+            self.lost[line.card.id] += lost
+            if batches or lost:
+                await to_the_end(partial(_write_remote, self.writer, line.card.id, batches, lost))
 
     def _frame_seen(self, t_ns: int) -> None:
         self._to_wifi += self._camera.frame(t_ns, time.monotonic_ns())
@@ -216,7 +251,14 @@ class WalkRecorder:
             await asyncio.sleep(LOOK_AHEAD_NS / 1e9)
 
 
-def _write_pictures(writer: SessionWriter, pictures: list[tuple[int, NDArray[np.uint8]]]) -> None:
+def _write_remote(writer: WalkWriter, card: str, batches: list[CsiBatch], lost: int) -> None:
+    if lost:
+        writer.lost(lost, card)
+    for batch in batches:
+        writer.append(batch, card)
+
+
+def _write_pictures(writer: WalkWriter, pictures: list[tuple[int, NDArray[np.uint8]]]) -> None:
     for t_ns, image in pictures:
         ok, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         if ok:
