@@ -1,6 +1,6 @@
 """The way in from the network: TLS, a certificate for each client, a role for each certificate.
 
-The daemon's router listens on the loopback interface only. The gate is a second router between it and the
+The daemon's router listens on the loopback interface only. The gate is a zenoh peer between it and the
 network, in a process of its own (vad.bus.gate_process). When the list of certificates changes, the gate comes
 up anew with it, within WATCH_S; clients reconnect by themselves, daemon and programs on the hub go on as
 before. The hub's own certificate is renewed before it ends.
@@ -65,7 +65,8 @@ def gate_config(settings: GateSettings, files: HubFiles, holders: Iterable[Certi
     in_force = tuple(holders)
     trusted = "".join(c.link for c in in_force).encode()
     tls = "transport/link/tls"
-    return plain_config("router", listen=settings.listen, connect=(settings.daemon,)) | {
+    # A second router would do, but zenoh 1.10 panics now and then where one of two routers goes away.
+    return plain_config("peer", listen=settings.listen, connect=(settings.daemon,)) | {
         f"{tls}/root_ca_certificate_base64": base64.b64encode(trusted).decode(),
         f"{tls}/listen_certificate": str(files.listener),
         f"{tls}/listen_private_key": str(files.listener),

@@ -11,6 +11,7 @@ import os
 import resource
 import sys
 import threading
+import time
 from collections import Counter
 
 import msgspec
@@ -20,7 +21,9 @@ from zenoh import handlers
 from vad.bus.audit import LOG_FILTER, AuditReader, Denied, Other, Refused
 from vad.bus.session import Values, open_config
 
-REPORT_EVERY_S = 1.0
+REPORT_EVERY_S = 0.25
+LINK_S = 5.0
+"""How long the link to the daemon is waited for; it comes later, too, when the daemon's router does."""
 MAX_TOLD = 32
 """Different denied attempts in one report; further ones are counted together."""
 MEMORY_BYTES = 512 * 1024 * 1024
@@ -140,6 +143,7 @@ def main() -> None:
     listener = session.info.declare_link_events_listener(
         handlers.Callback(tally.link, indirect=False), history=True
     )
+    _wait_for_the_daemon(session)
     _say(out, GateReport(state="listening"))
     threading.Thread(target=_wait_for_the_end, args=(ended,), daemon=True).start()
     while not ended.wait(REPORT_EVERY_S):
@@ -162,6 +166,13 @@ def _follow_log(tally: Tally) -> None:
     with os.fdopen(reading, encoding="utf-8", errors="replace") as lines:
         for line in lines:
             tally.line(line)
+
+
+def _wait_for_the_daemon(session: zenoh.Session) -> None:
+    """zenoh links to the daemon's router in the background; until then a client meets an empty home."""
+    until_s = time.monotonic() + LINK_S
+    while not list(session.info.routers_zid()) and time.monotonic() < until_s:
+        time.sleep(0.005)
 
 
 def _wait_for_the_end(ended: threading.Event) -> None:

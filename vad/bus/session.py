@@ -23,7 +23,7 @@ from vad.pki.credentials import ENVIRONMENT, load_credentials
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 TLS = "tls"
 
-Mode = Literal["router", "client"]
+Mode = Literal["router", "peer", "client"]
 Values = dict[str, Any]
 """Path in zenoh's configuration -> value."""
 
@@ -52,7 +52,8 @@ DROP_WAIT_FRAGMENT_US = 5000
 class BusSettings:
     """How a session connects.
 
-    hub: the name in every key (`*`, any hub, only for a client). mode: the daemon is its own router; a client
+    hub: the name in every key (`*`, any hub, only for a client). mode: the daemon is its own router, its gate
+    a peer of that; a client
     connects to one and fails at once where there is none. listen, connect: zenoh endpoints. credentials: the
     folder of `vad pki issue`, for a client over TLS; None: the one that VAD_CREDENTIALS names.
     """
