@@ -37,6 +37,29 @@ class Intrinsics:
         """K, (3, 3)."""
         return np.array([[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0.0, 0.0, 1.0]])
 
+    def scaled(self, width_px: int, height_px: int) -> Intrinsics:
+        """The same lens with pictures of another size; pixels are counted from the middle of the first.
+
+        Raises:
+            ValueError: a picture of another shape shows another part of what the lens sees.
+        """
+        x, y = width_px / self.width_px, height_px / self.height_px
+        if abs(x / y - 1.0) > 0.01:
+            raise ValueError(
+                f"the lens was measured in pictures of {self.width_px}x{self.height_px}, these are of "
+                f"{width_px}x{height_px}: another shape"
+            )
+        return Intrinsics(
+            width_px,
+            height_px,
+            self.fx_px * x,
+            self.fy_px * y,
+            (self.cx_px + 0.5) * x - 0.5,
+            (self.cy_px + 0.5) * y - 0.5,
+            self.k1,
+            self.k2,
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class Rigid:

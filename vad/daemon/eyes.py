@@ -15,7 +15,7 @@ from vad.daemon.walkers import PeopleSeen, Walkers
 from vad.geometry import Intrinsics
 from vad.health import Health
 from vad.mapping.camera_calibration import CameraCalibration
-from vad.mapping.camera_stage import CameraMapper
+from vad.mapping.camera_keeper import LOOK_EVERY_NS, CameraKeeper
 from vad.mapping.walk import WalkTrack
 from vad.robot.pose import RobotPose
 from vad.streams import DropOldestQueue
@@ -42,7 +42,8 @@ class Eyes:
     """Sees for the daemon. `calibration` and `tracks` are current after each frame.
 
     Args:
-        network: finds people. max_fps: frames above this rate are left out. focal_px: of a known lens.
+        network: finds people. max_fps: frames above this rate are left out. lens: a measured one, of any
+            picture size of the same shape; focal_px: of a lens of which that alone is known.
         known: a calibration of the same map epoch from an earlier run.
         on_calibration: called on the loop when the calibration changed.
 
@@ -56,6 +57,7 @@ class Eyes:
         *,
         max_fps: float,
         focal_px: float | None,
+        lens: Intrinsics | None = None,
         known: CameraCalibration | None,
         on_calibration: Callable[[CameraCalibration], None],
     ) -> None:
@@ -66,10 +68,12 @@ class Eyes:
         self.last_image: NDArray[np.uint8] | None = None
         self._walkers = Walkers(network)
         self._focal_px = focal_px
+        self._lens = lens
         self._step_ns = int(0.9e9 / max_fps)
         self._on_calibration = on_calibration
         self._finder = RobotFinder()
-        self._mapper: CameraMapper | None = None
+        self._keeper: CameraKeeper | None = None
+        self._looked_ns = -LOOK_EVERY_NS
         self._frame_listeners: list[Callable[[int], None]] = []
         self._poses: list[RobotPose] = []
         self._rest_xy = np.full(2, np.inf)
@@ -110,7 +114,7 @@ class Eyes:
 
     def begin_anew(self, calibration: CameraCalibration) -> None:
         """The map changed: go on from this calibration, with nothing of what was seen on the old map."""
-        self._mapper = None
+        self._keeper = None
         self._walkers.forget()
         self._poses.clear()
         self._take(calibration)
@@ -142,20 +146,7 @@ class Eyes:
         self.health.counters["frames"] += 1
         self.health.counters["people"] += len(seen.people.look.people)
         self.health.counters["people without a place"] += len(seen.people.refused)
-        mapper = self._mapper_for(frame.image)
-        for pose in self._poses:
-            mapper.add_pose(pose.t_ns, pose.x_m, pose.y_m, pose.sigma_m)
-        self._poses.clear()
-        if seen.candidates and robot_moves:
-            places = np.array([[c.x_px, c.y_px] for c in seen.candidates])
-            mapper.add_candidates(frame.t_ns, places, np.array([c.sigma_px for c in seen.candidates]))
-            self._new_evidence = True
-        if self._new_evidence and frame.t_ns - self._solved_ns > SOLVE_EVERY_NS:
-            self._solved_ns = frame.t_ns
-            self._new_evidence = False
-            found = await asyncio.to_thread(mapper.solve)
-            if mapper is self._mapper:  # else the map changed meanwhile
-                self._take_calibration(found)
+        await self._keep_calibrated(frame, seen.candidates if robot_moves else [])
         self._walkers.take(frame.t_ns, seen.people)
         for listener in tuple(self._frame_listeners):
             listener(frame.t_ns)
@@ -168,21 +159,42 @@ class Eyes:
             candidates = self._finder.update(frame.image, np.array(people.look.boxes).reshape(-1, 4))
         return _Seen(people, candidates)
 
-    def _mapper_for(self, image: NDArray[np.uint8]) -> CameraMapper:
-        if self._mapper is None:
+    async def _keep_calibrated(self, frame: Frame, candidates: list[RobotCandidate]) -> None:
+        """Give the keeper what came, and take from it how the camera stands."""
+        keeper = self._keeper_for(frame.image)
+        for pose in self._poses:
+            keeper.add_pose(pose.t_ns, pose.x_m, pose.y_m, pose.sigma_m)
+        self._poses.clear()
+        if candidates:
+            places = np.array([[c.x_px, c.y_px] for c in candidates])
+            keeper.add_candidates(frame.t_ns, places, np.array([c.sigma_px for c in candidates]))
+            self._new_evidence = True
+        before = keeper.calibration
+        if frame.t_ns - self._looked_ns > LOOK_EVERY_NS:
+            self._looked_ns = frame.t_ns
+            if await asyncio.to_thread(keeper.look, frame.t_ns, frame.image):
+                _log.warning("%s", keeper.calibration.reason)
+        if self._new_evidence and frame.t_ns - self._solved_ns > SOLVE_EVERY_NS:
+            self._solved_ns = frame.t_ns
+            self._new_evidence = False
+            await asyncio.to_thread(keeper.solve, frame.t_ns)
+        # Else the map changed meanwhile.
+        if keeper is self._keeper and keeper.calibration is not before:
+            self._take(keeper.calibration)
+
+    def _keeper_for(self, image: NDArray[np.uint8]) -> CameraKeeper:
+        if self._keeper is None:
             height, width = image.shape[:2]
             lens = None
-            if self._focal_px is not None:
+            if self._lens is not None:
+                lens = self._lens.scaled(width, height)
+            elif self._focal_px is not None:
                 centre = ((width - 1) / 2, (height - 1) / 2)
                 lens = Intrinsics(width, height, self._focal_px, self._focal_px, *centre)
-            self._mapper = CameraMapper(width, height, lens)
-        return self._mapper
-
-    def _take_calibration(self, found: CameraCalibration) -> None:
-        """A valid calibration is only replaced by a valid one: a new drive starts with few pairs."""
-        if self.calibration.status == "valid" and found.status != "valid":
-            return
-        self._take(found)
+            self._keeper = CameraKeeper(width, height, lens, self.calibration)
+            if self._keeper.calibration is not self.calibration:
+                self._take(self._keeper.calibration)
+        return self._keeper
 
     def _take(self, calibration: CameraCalibration) -> None:
         self.calibration = calibration

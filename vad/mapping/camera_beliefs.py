@@ -105,4 +105,4 @@ def _line_ends(
         sums += powers[:, :2, None] * xy_m[other][:, None, :]
     enough = moments[:, 0] >= _LINE_POSES
     normal = np.where(enough[:, None], moments, (1.0, 0.0, 1.0))[:, [[0, 1], [1, 2]]]
-    return np.linalg.solve(normal, sums)[:, 0], enough
+    return np.asarray(np.linalg.solve(normal, sums)[:, 0], dtype=np.float64), enough

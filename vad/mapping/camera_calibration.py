@@ -17,10 +17,11 @@ from vad.geometry import (
     rotation_from_vector,
     undistort,
 )
+from vad.mapping.camera_view import CameraView
 
-CameraStatus = Literal["uncalibrated", "collecting", "valid", "invalid"]
+CameraStatus = Literal["uncalibrated", "collecting", "valid", "invalid", "recalibrating"]
 
-SCHEMA = "vad.camera/1"
+SCHEMA = "vad.camera/2"
 # The order of the parameters in every covariance: a small rotation in the camera frame (rad), the camera's
 # position in the map (m), the logarithm of the focal length, k1, k2, the principal point (px).
 PARAMETERS = 11
@@ -55,7 +56,7 @@ class CameraCalibration:
     the robot's pose from the camera's floor point, each pair predicted without itself. homography_gap_m:
     mean distance on the floor between this estimate and a free homography of the same pairs; a large one
     says that the lens is not as described. time_offset_s: pose stamp minus frame stamp of the same moment.
-    parameter_covariance: (11, 11), see PARAMETERS.
+    parameter_covariance: (11, 11), see PARAMETERS. view: what the picture's still background looked like.
     """
 
     status: CameraStatus
@@ -72,6 +73,7 @@ class CameraCalibration:
     time_offset_s: float | None = None
     time_offset_sigma_s: float | None = None
     parameter_covariance: FloatArray | None = None
+    view: CameraView | None = None
 
     @property
     def position_m(self) -> FloatArray | None:
@@ -133,13 +135,14 @@ class CameraCalibration:
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON; `from_dict` reads them back."""
         plain: dict[str, Any] = {"schema": SCHEMA}
-        for name, value in asdict(self).items():
+        for name, value in asdict(replace(self, view=None)).items():
             if isinstance(value, np.ndarray):
                 plain[name] = value.tolist()
             elif isinstance(value, dict):
                 plain[name] = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in value.items()}
             else:
                 plain[name] = list(value) if isinstance(value, tuple) else value
+        plain["view"] = None if self.view is None else self.view.to_dict()
         return plain
 
     @staticmethod
@@ -199,4 +202,5 @@ def _from_plain(plain: dict[str, Any]) -> CameraCalibration:
         time_offset_s=number("time_offset_s"),
         time_offset_sigma_s=number("time_offset_sigma_s"),
         parameter_covariance=None if covariance is None else array(covariance, PARAMETERS, PARAMETERS),
+        view=None if plain["view"] is None else CameraView.from_dict(plain["view"]),
     )
