@@ -57,12 +57,17 @@ def test_several_devices_share_a_walk() -> None:
     assert decision.step == "somebody walks alone: measuring 01 (new), 02 (new)"
 
 
-def test_a_mapped_device_that_sends_anyway_comes_along() -> None:
+def test_a_mapped_device_that_sends_anyway_is_measured_more_often() -> None:
     book = Schedule(Limits(together=2))
     devices = [device(LAMP), device(TV, "mapped", walks=3)]
     book.decide(0, devices, NOBODY)
-    assert book.decide(H // 2, devices, WALKER).record == (LAMP,)
-    assert book.decide(2 * H, devices, WALKER).record == (LAMP, TV)
+    assert book.decide(2 * H, devices, WALKER).record == (LAMP,)
+    assert book.decide(3 * H, devices, WALKER).record == (LAMP, TV)
+    book.measured(3 * H, TV)
+    assert book.decide(4 * H, devices[1:], WALKER).record == ()
+    decision = book.decide(6 * H, devices[1:], NOBODY)
+    assert (decision.step, decision.record) == (s.ALL_MAPPED, ())
+    assert book.decide(6 * H, devices[1:], WALKER).record == (TV,)
 
 
 def test_nobody_and_several_people_are_reasons() -> None:
@@ -102,6 +107,13 @@ def test_a_device_is_asked_for_packets_and_measured_when_they_come() -> None:
     answered = replace(quiet, heard_per_s=200.0)
     decision = book.decide(S, [answered], WALKER)
     assert (decision.record, decision.provoke) == ((LAMP,), (LAMP,))
+
+
+def test_who_sends_enough_by_itself_is_not_asked() -> None:
+    busy, slow = (device(mac, heard=rate, reaches=True) for mac, rate in ((LAMP, 150.0), (TV, 70.0)))
+    decision = Schedule().decide(0, [busy, slow], WALKER)
+    assert decision.record == (LAMP, TV)
+    assert decision.provoke == (TV,)
 
 
 def test_a_mute_device_costs_a_moment_of_fewer_and_fewer_walks() -> None:

@@ -14,6 +14,8 @@ from typing import Literal
 Kind = Literal["new", "doubted", "stale", "sharpen", "check", "done"]
 
 MIN_PACKETS_PER_S = 60.0
+GOOD_PACKETS_PER_S = 100.0
+"""A device that sends so much by itself is not asked for more."""
 ANSWER_NS = 2_500_000_000
 """A device that was made to send shows packets within this time, or it does not answer."""
 RETRY_FIRST_NS = 60 * 1_000_000_000
@@ -22,11 +24,12 @@ RETRY_BLURRED_NS = 3600 * 1_000_000_000
 """First pause of a device that many walks did not make sharp; it doubles, too."""
 FRUITLESS = 3
 """After so many walks in a row that told nothing of it, a device goes before others no more."""
-FREE_CHECK_NS = 3600 * 1_000_000_000
-"""A mapped device that sends by itself is taken along this often: it costs no airtime."""
+FREE_CHECK_NS = 3 * 3600 * 1_000_000_000
+"""A mapped device that sends by itself is measured again this often: it costs no airtime."""
 
 NO_CALIBRATION = "the camera does not know yet where it is"
 NOBODY = "waiting for somebody to walk through the picture"
+ALL_MAPPED = "watching: every device is mapped; they are looked at again when somebody walks"
 TOO_FEW = "too few CSI packets of it are heard"
 NO_AIRTIME = "the airtime for provoked packets is used up for now, and it does not send by itself"
 SILENT = "it was asked for packets and sent none that carry CSI"
@@ -177,25 +180,26 @@ class Schedule:
         if not ready:
             return Decision("waiting for CSI packets of a device", waits)
         if len(view.movers) != 1:
-            step = NOBODY
+            step = NOBODY if any(d.state != "mapped" for d in wanted) else ALL_MAPPED
             if view.movers:
                 step = f"{len(view.movers)} people walk: waiting until one of them walks alone"
             for device in ready:
                 waits[device.mac] = self._wish(device) if not view.movers else step
             return Decision(step, waits)
-        return self._with_walker(now_ns, ready, devices, waits, view.movers[0])
+        return self._with_walker(now_ns, ready, waits, view.movers[0])
 
     def _with_walker(
         self,
         now_ns: int,
         ready: list[Candidate],
-        devices: Sequence[Candidate],
         waits: dict[str, str],
         track: int,
     ) -> Decision:
         """Somebody walks alone: the most wanted devices together, as soon as their packets come."""
         group = ready[: self.limits.together]
-        provoke = tuple(d.mac for d in group if d.reaches)
+        asked = {d.mac for d in group if self._book(now_ns, d.mac).asked_ns is not None}
+        weak = [d for d in group if d.mac in asked or d.heard_per_s < GOOD_PACKETS_PER_S]
+        provoke = tuple(d.mac for d in weak if d.reaches)
         missing = [d for d in group if not d.heard]
         for device in missing:
             book = self._book(now_ns, device.mac)
@@ -213,7 +217,6 @@ class Schedule:
         chosen = [d for d in group if d.heard]
         if not chosen:
             return Decision(f"{names} did not answer", waits)
-        chosen += self._free(now_ns, devices, chosen)
         return Decision(
             f"somebody walks alone: measuring {self._reasons(now_ns, chosen)}",
             {mac: why for mac, why in waits.items() if mac not in {d.mac for d in chosen}},
@@ -221,20 +224,6 @@ class Schedule:
             tuple(mac for mac in provoke if mac in {d.mac for d in chosen}),
             track,
         )
-
-    def _free(self, now_ns: int, devices: Sequence[Candidate], chosen: list[Candidate]) -> list[Candidate]:
-        """Mapped devices that send by themselves, into the places that are left."""
-        left = self.limits.together - len(chosen)
-        taken = {d.mac for d in chosen}
-        free = [
-            d
-            for d in devices
-            if d.mac not in taken
-            and d.state == "mapped"
-            and d.heard
-            and self._age_ns(now_ns, d) > FREE_CHECK_NS
-        ]
-        return sorted(free, key=lambda d: -self._age_ns(now_ns, d))[: max(0, left)]
 
     def _reasons(self, now_ns: int, chosen: list[Candidate]) -> str:
         words = {
@@ -275,7 +264,8 @@ class Schedule:
     def _check_due(self, now_ns: int, device: Candidate) -> bool:
         if self._book(now_ns, device.mac).look_again:
             return True
-        return 0 < self.limits.recheck_ns <= self._age_ns(now_ns, device)
+        due_ns = min(self.limits.recheck_ns, FREE_CHECK_NS) if device.heard else self.limits.recheck_ns
+        return 0 < due_ns <= self._age_ns(now_ns, device)
 
     def _age_ns(self, now_ns: int, device: Candidate) -> int:
         """How long ago the device was measured, as far as is remembered."""
