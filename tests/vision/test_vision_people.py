@@ -20,7 +20,7 @@ from vad.sim.scenario import CameraPlacement, Scenario, make_home
 from vad.vision.ground import GroundPoint, Refusal, ground_point
 from vad.vision.people import MotionGate, Person, PoseNetwork
 
-FRAME_S = 0.25
+FRAME_S = 0.4
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,9 @@ def walk_times(scenario: Scenario) -> list[float]:
     return [t for t in np.arange(walk.start_s, walk.end_s, FRAME_S) if inside(scenario, t)]
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize(
+    "seed", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)]
+)
 def test_the_network_finds_the_walker_and_the_ground_point_is_near_the_truth(
     network: PoseNetwork, seed: int
 ) -> None:
@@ -66,7 +68,7 @@ def test_the_network_finds_the_walker_and_the_ground_point_is_near_the_truth(
     error = np.array(errors)
     distance = np.linalg.norm(error, axis=1)
     # A step takes 0.75 s: averaged over that, what remains is the slow part.
-    slow = np.array([error[np.abs(np.array(seen_s) - t) < 0.4].mean(axis=0) for t in seen_s])
+    slow = np.array([error[np.abs(np.array(seen_s) - t) < 0.5].mean(axis=0) for t in seen_s])
     assert found >= 0.9 * len(times)
     assert len(errors) >= 0.7 * len(times)
     assert np.median(distance) < 0.12

@@ -1,4 +1,4 @@
-"""Identities and smooth paths of people on the floor."""
+"""Identities of people on the floor, and who of them moves alone."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vad.vision.tracks import FloatArray, Track, Tracker, lone_mover, smooth
+from vad.vision.movers import lone_mover, moving
+from vad.vision.tracks import FloatArray, Track, Tracker
 
 RATE_HZ = 15.0
 
@@ -40,7 +41,25 @@ def test_two_crossing_walkers_keep_their_identities(seed: int) -> None:
     first, second = tracker.tracks()
     climbs = sorted(float(track.xy_m[-1, 1] - track.xy_m[0, 1]) for track in (first, second))
     assert climbs == pytest.approx([-4.2, 4.2], abs=0.5)
-    assert lone_mover(tracker.tracks(), end_ns) is None
+    alone = lone_mover(tracker.tracks(), end_ns)
+    assert alone is not None
+    assert alone.probability < 0.01
+
+
+def test_six_people_at_once_keep_their_identities() -> None:
+    rng = np.random.default_rng(3)
+    lanes = np.arange(6) * 0.7
+    tracker = Tracker()
+    frames = []
+    for t in np.arange(0, 5, 1 / RATE_HZ):
+        along = np.where(np.arange(6) % 2, 0.9 * t, 4.5 - 0.9 * t)
+        places = np.stack([along, lanes], axis=1) + rng.normal(0, 0.06, (6, 2))
+        frames.append(places[rng.permutation(6)][rng.random(6) > 0.1])
+    run(tracker, frames)
+    tracks = tracker.tracks()
+    assert len(tracks) == 6
+    for track in tracks:
+        assert np.ptp(track.xy_m[:, 1]) < 0.5
 
 
 def test_a_single_false_point_is_nobody() -> None:
@@ -73,16 +92,77 @@ def test_a_track_survives_a_short_gap_and_ends_after_a_long_one() -> None:
     assert tracker.tracks() == []
 
 
-def test_the_one_who_moves_is_named_among_those_who_sit() -> None:
-    rng = np.random.default_rng(7)
-    t = np.arange(0, 3, 1 / RATE_HZ)
-    sitting = np.array([4.0, 4.0])
+def test_a_part_of_a_track_keeps_what_belongs_together() -> None:
     tracker = Tracker()
-    end_ns = run(tracker, [np.array([[0.9 * s, 1.0], sitting]) + rng.normal(0, 0.05, (2, 2)) for s in t])
-    mover = lone_mover(tracker.tracks(), end_ns)
-    (named,) = [track for track in tracker.tracks() if track.id == mover]
-    assert named.xy_m[-1, 1] == pytest.approx(1.0, abs=0.3)
-    assert lone_mover(tracker.tracks(), end_ns + 2_000_000_000) is None
+    run(tracker, [np.array([[0.1 * k, 1.0]]) for k in range(20)])
+    (track,) = tracker.tracks()
+    part = track.within(int(track.t_ns[5]), int(track.t_ns[9]))
+    assert np.array_equal(part.t_ns, track.t_ns[5:10])
+    assert np.array_equal(part.xy_m, track.xy_m[5:10])
+    assert len(part.bodies) == 5
+
+
+# -- who moves ---------------------------------------------------------------------------------------
+
+
+def scene(seed: int, *speeds_mps: float, sigma_m: float = 0.05) -> tuple[list[Track], int]:
+    """People at 2 m from one another who go at these speeds for 3 s; the tracks and the end."""
+    rng = np.random.default_rng(seed)
+    tracker = Tracker()
+    frames = [
+        np.array([[v * s, 2.0 * k] for k, v in enumerate(speeds_mps)])
+        + rng.normal(0, sigma_m, (len(speeds_mps), 2))
+        for s in np.arange(0, 3, 1 / RATE_HZ)
+    ]
+    end_ns = run(tracker, frames, sigma_m)
+    return tracker.tracks(), end_ns
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_one_who_moves_is_named_among_those_who_sit(seed: int) -> None:
+    tracks, end_ns = scene(seed, 0.0, 0.9, 0.0)
+    found = lone_mover(tracks, end_ns)
+    assert found is not None
+    (named,) = [track for track in tracks if track.id == found.track]
+    assert named.xy_m[-1, 1] == pytest.approx(2.0, abs=0.3)
+    assert found.probability > 0.9
+    assert lone_mover(tracks, end_ns + 2_000_000_000) is None
+
+
+def test_two_who_move_are_no_lone_mover_and_nobody_who_sits_is_one() -> None:
+    for speeds in ((0.9, 0.9), (0.0, 0.0)):
+        found = lone_mover(*scene(1, *speeds))
+        assert found is not None
+        assert found.probability < 0.1
+
+
+def test_the_probability_of_moving_rises_with_the_speed() -> None:
+    seen = []
+    for speed in (0.0, 0.15, 0.25, 0.4, 0.9):
+        scenes = [scene(seed, speed, sigma_m=0.08) for seed in range(10)]
+        seen.append(np.mean([moving(tracks, end_ns)[tracks[0].id] for tracks, end_ns in scenes]))
+    assert seen == sorted(seen)
+    assert seen[0] < 0.15
+    assert 0.3 < seen[2] < 0.7
+    assert seen[-1] > 0.95
+
+
+def test_somebody_without_a_place_makes_it_less_likely_that_the_walker_is_alone() -> None:
+    tracks, end_ns = scene(2, 0.9)
+    sure, doubtful = lone_mover(tracks, end_ns), lone_mover(tracks, end_ns, unplaced=1)
+    assert sure is not None
+    assert doubtful is not None
+    assert doubtful.probability == pytest.approx(0.5 * sure.probability)
+
+
+def test_who_goes_behind_something_still_counts_until_the_track_ends() -> None:
+    tracks, end_ns = scene(2, 0.9, 0.9)
+    hidden = lone_mover(tracks, end_ns + 1_200_000_000)
+    assert hidden is not None
+    assert hidden.probability < 0.1
+
+
+# -- robustness --------------------------------------------------------------------------------------
 
 
 def test_points_at_infinity_are_left_out_and_time_goes_forwards() -> None:
@@ -97,59 +177,9 @@ def test_points_at_infinity_are_left_out_and_time_goes_forwards() -> None:
 @given(st.lists(st.lists(st.tuples(st.floats(-9, 9), st.floats(-9, 9)), max_size=6), max_size=25))
 def test_any_points_leave_tracks_in_order(frames: list[list[tuple[float, float]]]) -> None:
     tracker = Tracker()
-    run(tracker, [np.array(points, dtype=float).reshape(-1, 2) for points in frames])
+    end_ns = run(tracker, [np.array(points, dtype=float).reshape(-1, 2) for points in frames])
     for track in tracker.tracks():
         assert np.all(np.diff(track.t_ns) > 0)
         assert track.xy_m.shape == (len(track.t_ns), 2)
-
-
-def stepping_walk(seed: int, step_hz: float, sigma_m: float = 0.09) -> tuple[Track, FloatArray]:
-    """A measured round walk of 14 s with swing, noise and a slow error; and the true velocity's function."""
-    rng = np.random.default_rng(seed)
-    t = np.sort(rng.uniform(0, 14, 200))
-    t_ns = (t * 1e9).astype(np.int64)
-    white, swing, slow = (np.sqrt(share) * sigma_m for share in (0.25, 0.5, 0.25))
-    phase = rng.uniform(0, 2 * np.pi, 2)
-    error = rng.normal(0, white, (len(t), 2)) + rng.normal(0, slow, 2)
-    error += np.sqrt(2) * swing * np.cos(2 * np.pi * step_hz * t[:, None] + phase)
-    track = Track(1, t_ns, true_path(t) + error, covariance(sigma_m, len(t)), True)
-    return track, true_path(t)
-
-
-def true_path(t: FloatArray) -> FloatArray:
-    angle = 2 * np.pi * t / 12
-    return np.stack([1.6 * np.cos(angle), 1.3 * np.sin(angle) + 0.2 * np.sin(2 * angle)], axis=1)
-
-
-@pytest.mark.parametrize("step_hz", [1.3, 1.8])
-def test_smoothing_removes_the_steps_and_its_covariance_is_true_within_a_factor_of_2(step_hz: float) -> None:
-    errors, ratios, raw, speed_errors = [], [], [], []
-    for seed in range(25):
-        track, truth = stepping_walk(seed, step_hz)
-        result = smooth(track)
-        at_s = result.t_ns * 1e-9
-        error = result.xy_m - true_path(at_s)
-        weight = np.linalg.inv(result.covariance_m2)
-        ratios.append(np.einsum("ni,nij,nj->n", error, weight, error).mean() / 2)
-        errors.append(np.mean(error**2))
-        raw.append(np.mean((track.xy_m - truth) ** 2))
-        velocity = (true_path(at_s + 0.01) - true_path(at_s - 0.01)) / 0.02
-        speed_errors.append(np.mean((result.velocity_mps - velocity) ** 2))
-        assert np.all(np.linalg.eigvalsh(result.covariance_m2 - result.slow_covariance_m2) > 0)
-    assert 0.5 < np.mean(ratios) < 2.0
-    assert np.sqrt(np.mean(errors)) < 0.7 * np.sqrt(np.mean(raw))
-    assert np.sqrt(np.mean(speed_errors)) < 0.15
-
-
-def test_one_wild_point_hardly_bends_the_path() -> None:
-    track, _ = stepping_walk(3, 1.8)
-    xy = track.xy_m.copy()
-    xy[100] += (0.9, -0.7)
-    bent = smooth(Track(1, track.t_ns, xy, track.covariance_m2, True))
-    assert np.abs(bent.xy_m - smooth(track).xy_m).max() < 0.15
-
-
-def test_a_single_point_has_no_path() -> None:
-    track = Track(1, np.array([5], dtype=np.int64), np.zeros((1, 2)), covariance(0.1), False)
-    with pytest.raises(ValueError, match="fewer than two"):
-        smooth(track)
+        assert len(track.bodies) == len(track.t_ns)
+    assert all(0.0 <= p <= 1.0 for p in moving(tracker.tracks(), end_ns).values())

@@ -15,7 +15,7 @@ from vad.vision.tracks import HITS_TO_CONFIRM, LOST_AFTER_S, Track
 
 # Who goes faster than this moves; slower is swaying, and the network's jitter.
 MOVING_MPS = 0.25
-_WINDOW_S = 1.0
+_WINDOW_S = 1.5
 # Neighbouring points err alike for some pictures, so that they count for this many fewer.
 _POINTS_FOR_ONE = 4.0
 # Somebody seen whose place cannot be told (their feet are cut off, say) is as likely to move as not.
@@ -56,9 +56,9 @@ def _there(track: Track, t_ns: int) -> bool:
 
 
 def _moves(track: Track) -> float:
-    """The probability that the speed is above MOVING_MPS, from a line through the last second of points.
+    """The probability that the speed is above MOVING_MPS, from a line through the latest points.
 
-    One step's swing is no speed: a second holds one or two of them.
+    One step's swing is no speed: the line spans two or three of them.
     """
     age_s = (track.t_ns[-1] - track.t_ns) * 1e-9
     lately = age_s < _WINDOW_S
