@@ -87,7 +87,7 @@ async def test_coming_and_going(socket_path: Path, own_dir: Path, source: Hostap
             async with asyncio.timeout(1.0):
                 event = await out.get()
             assert before_ns <= event.t_ns <= time.monotonic_ns()
-            assert (event.kind, event.mac, event.interface, event.name) == ("joined", A, "wlan0", None)
+            assert (event.kind, event.mac, event.interface, event.host_name) == ("joined", A, "wlan0", None)
             hostapd.leave(A)
             assert await take(out) == ("left", A)
             assert source.health.detail == "0 stations"
@@ -248,9 +248,9 @@ async def test_the_emulator_answers_like_hostapd(socket_path: Path, own_dir: Pat
 
 async def test_the_static_list() -> None:
     out = Events(8)
-    source = StaticList([A.upper(), B, A], interface="wlan0")
+    source = StaticList([A.upper(), B, A])
     async with running(source, out):
-        assert [await take(out), await take(out)] == [("joined", A), ("joined", B)]
+        assert [await take(out), await take(out)] == [("listed", A), ("listed", B)]
         assert source.health.state == "ok"
         assert len(out) == 0
 

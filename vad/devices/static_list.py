@@ -13,17 +13,16 @@ from vad.streams import DropOldestQueue
 
 
 class StaticList:
-    """A JoinSource that lets every listed MAC join once, at its start; VadError for text that is no MAC."""
+    """A JoinSource that lists every MAC once, at its start; VadError for text that is no MAC."""
 
-    def __init__(self, macs: Sequence[str], *, interface: str = "") -> None:
+    def __init__(self, macs: Sequence[str]) -> None:
         self.health = Health("static devices")
         self._macs = tuple(dict.fromkeys(normal_mac(mac) for mac in macs))
-        self._interface = interface
 
     async def run(self, out: DropOldestQueue[StationEvent]) -> None:
         """Emit all devices, then wait until cancelled."""
         for mac in self._macs:
-            out.put(StationEvent(time.monotonic_ns(), "joined", mac, self._interface))
-            self.health.counters["joined"] += 1
+            out.put(StationEvent(time.monotonic_ns(), "listed", mac, "settings"))
+            self.health.counters["listed"] += 1
         self.health.ok(f"{len(self._macs)} devices")
         await asyncio.get_running_loop().create_future()

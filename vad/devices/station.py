@@ -8,16 +8,33 @@ from typing import Literal, Protocol
 from vad.health import Health
 from vad.streams import DropOldestQueue
 
+Kind = Literal["joined", "left", "told", "listed"]
+
 
 @dataclass(frozen=True, slots=True)
 class StationEvent:
-    """A station came or went. mac: lower-case text; interface: where it was seen; name: if known."""
+    """Something is known of a station.
+
+    Attributes:
+        t_ns: when, on the one timeline.
+        kind: `joined` and `left` the network; `told`: more is known of a station that may or may not be in;
+            `listed`: a person named it, whether it is in or not.
+        mac: lower-case text.
+        interface: where it was seen; one station may be in on several at once.
+        host_name: what the station calls itself when it asks for an address.
+        client_id: its DHCP client identifier, hexadecimal bytes with colons.
+        ip: its IPv4 address.
+        agent: the id of a remote CSI node; None for every other station.
+    """
 
     t_ns: int
-    kind: Literal["joined", "left"]
+    kind: Kind
     mac: str
     interface: str
-    name: str | None = None
+    host_name: str | None = None
+    client_id: str | None = None
+    ip: str | None = None
+    agent: str | None = None
 
 
 class JoinSource(Protocol):
