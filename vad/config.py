@@ -132,10 +132,12 @@ CameraSourceSettings = (
 
 
 class CameraSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The camera. id: its name on the bus; focal_px: known focal length, else it is estimated."""
+    """The camera. id: its name on the bus. intrinsics: a file that `vad camera intrinsics` wrote; or focal_px,
+    if that alone is known; with neither the lens is estimated from the robot's drive."""
 
     source: CameraSourceSettings
     id: Id = "main"
+    intrinsics: str | None = None
     focal_px: Positive | None = None
 
 
@@ -177,9 +179,19 @@ class StaticDevice(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 
 class DeviceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Who may appear on the map. hostapd: control sockets, e.g. /run/hostapd/wlan0."""
+    """Who may appear on the map.
+
+    hostapd: control sockets, e.g. /run/hostapd/wlan0. nl80211: access point interfaces that the kernel tells
+    of, for those without a control socket. leases: dnsmasq's lease files, for names and addresses; where
+    neither of the others is given, a lease lets its device join. agents: remote CSI nodes join, too. makers:
+    a list of makers (IEEE's oui.txt, nmap's, Wireshark's); left out: the system's.
+    """
 
     hostapd: tuple[str, ...] = ()
+    nl80211: tuple[str, ...] = ()
+    leases: tuple[str, ...] = ()
+    agents: bool = True
+    makers: str | None = None
     static: tuple[StaticDevice, ...] = ()
     ignore: tuple[MacText, ...] = ()
 
@@ -204,12 +216,6 @@ class BusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
     connect: tuple[str, ...] = ()
     pki: str | None = None
-
-
-class MetricsSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Prometheus metrics at http://127.0.0.1:<port>/metrics; left out: none."""
-
-    port: Annotated[int, Meta(ge=1, le=65535)] | None = None
 
 
 class MetricsSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -268,7 +274,6 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     source: Literal["live", "simulated"] = "live"
     state_dir: str = "/var/lib/vad"
     bus: BusSettings = BusSettings()
-    metrics: MetricsSettings = MetricsSettings()
     metrics: MetricsSettings = MetricsSettings()
     capture: CaptureSettings = CaptureSettings()
     vision: VisionSettings = VisionSettings()
@@ -339,6 +344,8 @@ def brings_map(robot: RobotSettings) -> bool:
 
 def _check_robot(settings: Settings, where: str) -> None:
     robot = settings.robot
+    if settings.camera.intrinsics is not None and settings.camera.focal_px is not None:
+        raise ConfigError("give either intrinsics or focal_px", where=f"{where}: $.camera")
     if settings.map.file is None and not brings_map(robot):
         raise ConfigError(
             "there is no floor plan: this robot brings none",

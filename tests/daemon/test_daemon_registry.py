@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import replace
@@ -12,16 +13,20 @@ from typing import TypeVar
 import msgspec
 import numpy as np
 import pytest
-from daemon_world import free_port, settings_for
+from daemon_world import LONG_AGO, free_port, settings_for
 
 from vad.bus import messages as m
 from vad.bus.node import Bus
 from vad.bus.session import BusSettings
 from vad.client import VadClient
 from vad.daemon.registry import Registry
+from vad.devices.station import Kind, StationEvent
+from vad.errors import VadError
 from vad.mapping.posterior import Grid, Posterior
 from vad.sim.home import floor_plan
 from vad.sim.scenario import make_home
+from vad.store.records import DeviceRecord
+from vad.store.store import Store
 from vad.store.worker import StoreWorker
 
 LAMP, TV, PHONE = (f"f4:f5:d8:00:00:0{k}" for k in (1, 2, 3))
@@ -154,7 +159,8 @@ async def test_a_restart_keeps_everything(tmp_path: Path) -> None:
 
 
 def replace_times(message: m.DeviceMessage) -> m.DeviceMessage:
-    return msgspec.structs.replace(message, published_at="")
+    """Without what a restart does change: nobody is in the network until a source says so."""
+    return msgspec.structs.replace(message, published_at="", in_network=False)
 
 
 async def test_another_map_makes_places_stale_until_they_are_measured_anew(tmp_path: Path) -> None:
@@ -224,3 +230,141 @@ async def test_the_same_reason_again_is_no_news(tmp_path: Path) -> None:
         before = home.registry.get(LAMP)
         await home.registry.wait(LAMP, "it is not heard at all")
         assert home.registry.get(LAMP) is before
+
+
+RANDOM, RANDOM_LATER = "02:00:00:00:00:0a", "06:00:00:00:00:0b"
+
+
+def event(kind: Kind, mac: str, after_s: float = 0.0, **facts: str) -> StationEvent:
+    return StationEvent(time.monotonic_ns() + round(after_s * 1e9), kind, mac, "wlan0", **facts)
+
+
+async def test_who_a_device_is_is_published_and_survives_a_restart(tmp_path: Path) -> None:
+    makers = tmp_path / "manuf"
+    makers.write_text("f4f5d8 Google\n")
+    devices = {"hostapd": ["x"], "makers": str(makers)}
+    async with hub(tmp_path, devices=devices) as home:
+        assert await home.registry.take([event("joined", LAMP)]) == [LAMP]
+        told = event("told", LAMP, host_name="nest-mini", ip="192.168.1.20")
+        assert await home.registry.take([told]) == []
+        message = await home.published(LAMP)
+        assert (message.vendor, message.host_name, message.ip) == ("Google", "nest-mini", "192.168.1.20")
+        assert (message.name, message.macs, message.random_mac) == ("nest-mini", (LAMP,), False)
+        assert (message.in_network, message.moved, message.agent) == (True, False, None)
+        assert message.first_seen is not None
+        assert home.registry.ip_of(LAMP) == "192.168.1.20"
+        await home.registry.take([event("left", LAMP)])
+        before = await home.published(LAMP)
+        assert (before.in_network, before.last_seen is None) == (False, False)
+    async with hub(tmp_path, devices=devices) as home:
+        assert replace_times(await home.published(LAMP)) == replace_times(before)
+        assert home.registry.ip_of(LAMP) == "192.168.1.20"
+
+
+async def test_a_phone_with_a_new_address_keeps_its_walks(tmp_path: Path) -> None:
+    async with hub(tmp_path) as home:
+        registry = home.registry
+        await registry.take([event("joined", RANDOM, host_name="Annas-Phone", ip="10.0.0.5")])
+        for _ in range(2):
+            await registry.add_evidence(RANDOM, evidence(0.2), 5000, 14.0)
+        await registry.take([event("left", RANDOM)])
+        assert await registry.take([event("joined", RANDOM_LATER)]) == [RANDOM_LATER]
+        assert (await home.published(RANDOM_LATER)).state == "discovered"
+        await registry.take([event("told", RANDOM_LATER, host_name="Annas-Phone", ip="10.0.0.6")])
+        assert await home.ask(lambda client: client.device(RANDOM_LATER)) is None
+        phone = await home.published(RANDOM)
+        assert (phone.state, phone.walks, phone.macs) == ("mapped", 2, (RANDOM, RANDOM_LATER))
+        assert registry.sends_as(RANDOM) == RANDOM_LATER
+        assert registry.ip_of(RANDOM) == "10.0.0.6"
+        assert [device.mac for device in registry.all()] == [RANDOM]
+    async with hub(tmp_path) as home:
+        assert [device.mac for device in home.registry.all()] == [RANDOM]
+        assert home.registry.sends_as(RANDOM) == RANDOM_LATER
+
+
+async def test_who_comes_back_after_a_while_may_have_been_carried(tmp_path: Path) -> None:
+    async with hub(tmp_path) as home:
+        registry = home.registry
+        assert await registry.take([event("joined", LAMP)]) == [LAMP]
+        assert await registry.take([event("left", LAMP, 10.0), event("joined", LAMP, 12.0)]) == []
+        assert await registry.take([event("left", LAMP, 20.0)]) == []
+        assert await registry.take([event("joined", LAMP, 60.0)]) == [LAMP]
+
+
+async def test_what_is_ignored_vanishes_and_comes_back_as_it_was(tmp_path: Path) -> None:
+    async with hub(tmp_path) as home:
+        await home.registry.joined(LAMP, "lamp")
+        for _ in range(2):
+            await home.registry.add_evidence(LAMP, evidence(0.2), 5000, 14.0)
+        await home.registry.ignore(LAMP.upper(), on=True)
+        assert await home.ask(lambda client: client.devices()) == []
+        assert await home.ask(lambda client: client.heatmap(LAMP)) is None
+        await home.registry.joined(LAMP, "lamp")
+        assert home.registry.all() == []
+    async with hub(tmp_path) as home:
+        assert home.registry.all() == []
+        assert await home.ask(lambda client: client.devices()) == []
+        await home.registry.ignore(LAMP, on=False)
+        again = await home.published(LAMP)
+        assert (again.state, again.walks, again.name) == ("mapped", 2, "lamp")
+        with pytest.raises(VadError, match="no device with the address"):
+            await home.registry.ignore(TV, on=True)
+
+
+async def test_a_device_is_renamed_and_forgotten(tmp_path: Path) -> None:
+    async with hub(tmp_path, devices={"static": [{"mac": TV, "name": "the big one"}]}) as home:
+        await home.registry.joined(LAMP, "ESP_1234")
+        await home.registry.joined(TV, None)
+        await home.registry.rename(LAMP, "lamp")
+        assert (await home.published(LAMP)).name == "lamp"
+        with pytest.raises(VadError, match="'the big one' in the settings"):
+            await home.registry.rename(TV, "small")
+    async with hub(tmp_path) as home:
+        assert (await home.published(LAMP)).name == "lamp"
+        await home.registry.rename(LAMP, "")
+        assert (await home.published(LAMP)).name == "ESP_1234"
+        await home.registry.add_evidence(LAMP, evidence(0.2), 5000, 14.0)
+        await home.registry.forget(LAMP)
+        assert await home.ask(lambda client: client.device(LAMP)) is None
+        await home.registry.joined(LAMP, None)
+        fresh = await home.published(LAMP)
+        assert (fresh.state, fresh.walks, fresh.name) == ("discovered", 0, None)
+
+
+@pytest.mark.slow
+async def test_several_thousand_passers_by_leave_the_home_as_it_was(tmp_path: Path) -> None:
+    async with hub(tmp_path) as home:
+        registry = home.registry
+        await registry.joined(LAMP, "lamp")
+        await registry.add_evidence(LAMP, evidence(0.2), 5000, 14.0)
+        for begin in range(0, 3000, 500):
+            events = []
+            for number in range(begin, begin + 500):
+                mac = f"02:00:00:00:{number >> 8:02x}:{number & 255:02x}"
+                events += [event("joined", mac, host_name=f"p-{number}"), event("left", mac)]
+            await registry.take(events)
+        assert len(registry.all()) <= 1000
+        assert (await home.published(LAMP)).walks == 1
+        assert len(await home.ask(lambda client: client.devices())) == len(registry.all())
+    async with hub(tmp_path) as home:
+        assert len(home.registry.all()) <= 1000
+        assert home.registry.get(LAMP).walks == 1
+
+
+async def test_devices_of_a_store_without_a_table_are_taken_in(tmp_path: Path) -> None:
+    with Store(tmp_path / "vad.sqlite") as store:
+        store.save_device(DeviceRecord(LAMP, "waiting", LONG_AGO, LONG_AGO, name="lamp"))
+    async with hub(tmp_path) as home:
+        message = await home.published(LAMP)
+        assert (message.name, message.first_seen, message.macs) == ("lamp", LONG_AGO, (LAMP,))
+
+
+async def test_a_doubted_place_says_so(tmp_path: Path) -> None:
+    async with hub(tmp_path) as home:
+        await home.registry.joined(LAMP, None)
+        for _ in range(2):
+            await home.registry.add_evidence(LAMP, evidence(0.2), 5000, 14.0)
+        await home.registry.doubt(LAMP, on=True)
+        assert (await home.published(LAMP)).moved
+        await home.registry.doubt(LAMP, on=False)
+        assert not (await home.published(LAMP)).moved

@@ -44,6 +44,11 @@ class DeviceMessage(Message, frozen=True, kw_only=True):
     reason: why it waits, failed or is stale; empty otherwise. covariance_m2: 2x2 of (x, y). radius90_m:
     radius of the circle around (x, y) that holds 90 % of the posterior. region90: outline of the 90 % region,
     metres. walks: how many walks went into the estimate. evidence: named counts (packets, seconds ...).
+
+    mac: the address it was first seen with, its name for good; macs: every address it had, the present one
+    last; random_mac: whether that one is made up. host_name: what it calls itself. vendor: its maker. agent:
+    the id of a remote CSI node. in_network: whether it is in now. first_seen, last_seen: RFC 3339, UTC; the
+    latter when it last came or went. moved: new evidence contradicts its place.
     """
 
     schema: Literal["vad.device.v1"] = "vad.device.v1"
@@ -62,6 +67,16 @@ class DeviceMessage(Message, frozen=True, kw_only=True):
     evidence: dict[str, float] = {}
     updated_at: str | None = None
     method: str | None = None
+    macs: tuple[str, ...] = ()
+    random_mac: bool = False
+    ip: str | None = None
+    host_name: str | None = None
+    vendor: str | None = None
+    agent: str | None = None
+    in_network: bool = False
+    first_seen: str | None = None
+    last_seen: str | None = None
+    moved: bool = False
 
     @property
     def sigma_m(self) -> float | None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import zenoh
 
+from vad.agent.info import decode_info
 from vad.bus.gate import Gate, GateSettings
+from vad.bus.keys import HubKeys
 from vad.bus.session import local_endpoints, tls_endpoints
 from vad.camera.folder import FolderCamera, Recording
 from vad.camera.frame import CameraSource
@@ -16,7 +19,6 @@ from vad.camera.rtsp import RtspCamera
 from vad.camera.v4l2 import V4l2Camera, V4l2Settings
 from vad.config import (
     CameraSettings,
-    DeviceSettings,
     FolderCameraSettings,
     Kinect2CameraSettings,
     LineRobot,
@@ -32,7 +34,10 @@ from vad.config import (
 )
 from vad.csi.open_source import open_source
 from vad.csi.packets import CsiSource
+from vad.devices.agents import AgentSaid, AgentSource
 from vad.devices.hostapd_source import HostapdSource
+from vad.devices.lease_source import LeaseSource
+from vad.devices.nl80211_source import Nl80211Source
 from vad.devices.static_list import StaticList
 from vad.devices.station import JoinSource
 from vad.mac import mac_from_text
@@ -110,11 +115,32 @@ def csi_source(settings: RadioSettings, base: Path) -> CsiSource:
     return open_source(settings.source, base, transmitter)
 
 
-def join_sources(settings: DeviceSettings, base: Path) -> list[JoinSource]:
-    """Everything that tells of stations."""
+def join_sources(settings: Settings, base: Path, session: zenoh.Session) -> list[JoinSource]:
+    """Everything that tells of stations; relative paths are taken from `base`.
+
+    Leases let devices join only where no access point tells who is in.
+    """
+    devices, own_dir = settings.devices, _shared_dir()
     sources: list[JoinSource] = [
-        HostapdSource(base / path, interface=Path(path).name) for path in settings.hostapd
+        HostapdSource(base / path, interface=Path(path).name, own_dir=own_dir) for path in devices.hostapd
     ]
-    if settings.static:
-        sources.append(StaticList([device.mac for device in settings.static]))
+    if devices.nl80211:
+        sources.append(Nl80211Source(devices.nl80211))
+    no_access_point = not sources
+    sources += [LeaseSource(base / path, joins=no_access_point) for path in devices.leases]
+    if devices.static:
+        sources.append(StaticList([device.mac for device in devices.static]))
+    if devices.agents:
+        sources.append(AgentSource(session, HubKeys(settings.hub).agent_alive(), _agent_said))
     return sources
+
+
+def _agent_said(payload: bytes) -> AgentSaid:
+    info = decode_info(payload)
+    return AgentSaid(info.mac, info.name)
+
+
+def _shared_dir() -> Path | None:
+    """Where hostapd finds our socket: systemd gives services a /tmp of their own."""
+    folder = os.environ.get("RUNTIME_DIRECTORY")
+    return None if folder is None else Path(folder.partition(":")[0])

@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,13 +20,15 @@ from vad.bus.node import Bus, now_rfc3339
 from vad.bus.session import BusSettings as NodeSettings
 from vad.bus.session import local_endpoints
 from vad.camera.frame import Frame
+from vad.camera.lens_file import camera_lens
 from vad.config import Settings, resolve
 from vad.csi.packets import CsiBatch
 from vad.daemon.adapters import camera_source, csi_source, join_sources, network_gate, robot_source
+from vad.daemon.agents import Agents
 from vad.daemon.captures import Captures
 from vad.daemon.checks import check_listen
 from vad.daemon.ears import Ears
-from vad.daemon.eyes import Eyes
+from vad.daemon.eyes import Eyes, known_calibration
 from vad.daemon.floor import SAY_WAITING_S, Change, FloorKeeper, first_plan, follow_plans
 from vad.daemon.metrics import MetricsServer, StatusCollector
 from vad.daemon.notify import notify
@@ -128,7 +131,7 @@ class Daemon:
         robot = robot_source(settings, self._bus.session)
         camera = camera_source(settings.camera, self._base)
         csi = csi_source(settings.radio, self._base)
-        joins = join_sources(settings.devices, self._base)
+        joins = join_sources(settings, self._base, self._bus.session)
         poses: DropOldestQueue[RobotPose] = DropOldestQueue(256)
         group.create_task(robot.run(poses), name="robot")
         rooms = await asyncio.to_thread(load_rooms, self._rooms_file) if self._rooms_file else ()
@@ -140,13 +143,15 @@ class Daemon:
             self._network,
             max_fps=settings.vision.max_fps,
             focal_px=settings.camera.focal_px,
+            lens=await asyncio.to_thread(camera_lens, settings.camera, self._base),
             known=known,
             on_calibration=self._calibrations.put,
         )
         ears = Ears()
         registry = Registry(settings, self._plan, self._bus, self._store)
         await self._patiently(registry.load(), robot)
-        captures = Captures(settings, self._state_dir, self._plan, eyes, ears, registry, self._bus)
+        agents = Agents(self._bus.keys)
+        captures = Captures(settings, self._state_dir, self._plan, eyes, ears, registry, self._bus, agents)
         self._publish_map()
         self._publish_camera(eyes.calibration)
 
@@ -160,7 +165,8 @@ class Daemon:
         group.create_task(eyes.follow_robot(poses), name="robot poses")
         group.create_task(eyes.run(frames), name="vision")
         group.create_task(ears.run(batches), name="ears")
-        group.create_task(_register(stations, registry), name="stations")
+        group.create_task(agents.run(self._bus.session), name="agents")
+        group.create_task(_register(stations, registry, captures.joined), name="stations")
         group.create_task(captures.run(), name="captures")
         group.create_task(self._keep_calibrations(), name="calibrations")
         follow = partial(self._use_plan, robot, eyes, registry, captures)
@@ -173,7 +179,9 @@ class Daemon:
             camera.health,
             eyes.health,
             csi.health,
+            agents.health,
             *captures.parts,
+            registry.roster.health,
             self._bus.health,
             self._store.health,
             *([self._gate.health] if self._gate is not None else []),
@@ -243,8 +251,7 @@ class Daemon:
         await self._save_epoch()
         for record in await self._store.cameras(epoch):
             if record.id == self._settings.camera.id:
-                known = CameraCalibration.from_dict(record.calibration)
-                return known if known.status == "valid" else None
+                return known_calibration(record.calibration)
         return None
 
     async def _keep_calibrations(self) -> None:
@@ -324,11 +331,17 @@ def _first(errors: ExceptionGroup[VadError]) -> VadError:
     return _first(error) if isinstance(error, ExceptionGroup) else error
 
 
-async def _register(stations: DropOldestQueue[StationEvent], registry: Registry) -> None:
+async def _register(
+    stations: DropOldestQueue[StationEvent], registry: Registry, joined: Callable[[str], None]
+) -> None:
+    """Take in what the join sources tell, until cancelled; `joined` hears of who is new or came back."""
     while True:
-        event = await stations.get()
-        if event.kind == "joined":
-            await registry.joined(event.mac, event.name)
+        events: list[StationEvent] = []
+        with suppress(TimeoutError):
+            async with asyncio.timeout(registry.roster.patience_s):
+                events = [await stations.get()]
+        for mac in await registry.take([*events, *stations.drain()]):
+            joined(mac)
 
 
 def _matrix3(matrix: np.ndarray[Any, np.dtype[np.float64]] | None) -> m.Matrix3 | None:

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from vad.bus import messages as m
 from vad.bus.node import Bus, now_rfc3339
 from vad.config import Settings
+from vad.daemon.device_message import device_message
 from vad.daemon.floor import moved_estimate
+from vad.daemon.posteriors import outer_edges, posterior_of
+from vad.daemon.roster import Roster
+from vad.daemon.verdict import another_walk, verdict
+from vad.devices.device import Device
+from vad.devices.station import StationEvent
+from vad.errors import VadError
 from vad.mac import normal_mac
 from vad.mapping.device_stage import PlaceEstimate, place_from_posterior
 from vad.mapping.evidence import joint_posterior
@@ -22,11 +30,9 @@ from vad.store.records import DeviceRecord, Estimate, PosteriorRecord
 from vad.store.worker import StoreWorker
 
 METHOD = "spectrogram-likelihood"
-STAYS_MAPPED = 1.5
-"""A mapped device is one until its region is this much larger than what made it one."""
-SURE_OF_ROOM = 0.9
-NEGLIGIBLE = 1e-6
-"""Cells below this share do not decide a room."""
+AWAY_NS = 30_000_000_000
+"""A device that was out of the network for so long may have been carried elsewhere."""
+PARTED = "two devices were taken for one, and its walks may be the other's: it is measured again"
 DOUBTED = "its last walk says that it is elsewhere: it is measured again"
 
 
@@ -39,20 +45,34 @@ class Registry:
         self._bus = bus
         self._store = store
         self._devices: dict[str, DeviceRecord] = {}
-        self._ignored = {normal_mac(mac) for mac in settings.devices.ignore}
-        self._names = {normal_mac(d.mac): d.name for d in settings.devices.static}
-        self._addresses = {normal_mac(d.mac): d.ip for d in settings.devices.static}
+        self._left_ns: dict[str, int] = {}
+        self.roster = Roster(settings.devices, store, self._measured)
+
+    def _measured(self, mac: str) -> bool:
+        return mac in self._devices and self._devices[mac].walks > 0
 
     async def load(self) -> None:
-        """What earlier runs knew; coordinates of another map epoch are stale, a cut-off capture waits."""
+        """What earlier runs knew; coordinates of another map epoch are stale, a cut-off capture waits.
+
+        Ignored devices stay in the store and are nowhere to be seen.
+        """
+        await self.roster.load()
         for record in await self._store.devices():
-            known = record
+            device = self.roster.table.find(record.mac)
+            if device is None:
+                await self.roster.adopt(record.mac, record.name, record.discovered_at)
+            elif device.mac != record.mac:
+                await self._store.forget_device(record.mac)  # cut off while two became one
+                continue
+            if self._ignores(record.mac):
+                continue
+            known = replace(record, name=self._name(record.mac))
             if stale := self._stale(record):
                 known = replace(record, state="stale", reason=stale)
             elif record.state == "capturing":
                 known = replace(record, state="waiting", reason="the daemon stopped during a capture")
             self._devices[record.mac] = known
-            if known is not record:
+            if known != record:
                 await self._store.save_device(known)
             self._publish(known)
             posterior = await self._store.posterior(record.mac)
@@ -72,19 +92,107 @@ class Registry:
         """Every device, in order of discovery."""
         return list(self._devices.values())
 
-    async def joined(self, mac: str, name: str | None) -> None:
-        """A station joined; a known one keeps what is known of it."""
-        if mac in self._ignored:
-            return
+    async def joined(self, mac: str, host_name: str | None) -> None:
+        """A station joined and told its name."""
+        now_ns = time.monotonic_ns()
+        await self.take([StationEvent(now_ns, "joined", normal_mac(mac), "", host_name=host_name)])
+
+    async def take(self, events: Sequence[StationEvent]) -> list[str]:
+        """What join sources tell; the devices that are new or came back, by `mac`.
+
+        A known device keeps what is known of it, under whatever address it comes.
+        """
+        changed: dict[str, Device] = {}
+        for change in await self.roster.take(events):
+            mac = change.device.mac
+            changed.pop(mac, None)
+            if change.kind == "gone":
+                self._drop(mac)
+            elif not self._ignores(mac):
+                changed[mac] = change.device
+        fresh = [mac for mac in changed if mac not in self._devices]
+        await self._describe(changed.values())
+        return list(dict.fromkeys([*fresh, *self._back(events)]))
+
+    def _back(self, events: Sequence[StationEvent]) -> list[str]:
+        """Devices that were away long enough to have been carried elsewhere."""
+        back = []
+        for event in events:
+            device = self.roster.table.find(event.mac)
+            if device is None or device.mac not in self._devices:
+                continue
+            if event.kind == "left":
+                self._left_ns[device.mac] = event.t_ns
+            elif event.kind == "joined":
+                left_ns = self._left_ns.pop(device.mac, event.t_ns)
+                back += [device.mac] if event.t_ns - left_ns >= AWAY_NS else []
+        return back
+
+    async def _describe(self, devices: Iterable[Device]) -> None:
+        """Tell what the table says of devices; a new one is discovered."""
+        told = [self._described(device) for device in devices]
+        if news := [record for record in told if record != self._devices.get(record.mac)]:
+            await self._store.save_devices(news)
+        for record in told:
+            new = record.mac not in self._devices
+            self._devices[record.mac] = record
+            self._publish(record)
+            if new and record.state == "discovered":
+                self._event("joined", record.mac, f"{record.name or record.mac} joined the network")
+
+    def _described(self, device: Device) -> DeviceRecord:
+        mac, name = device.mac, self._name(device.mac)
         known = self._devices.get(mac)
-        name = self._names.get(mac) or name
         if known is None:
             now = now_rfc3339()
-            record = DeviceRecord(mac, "discovered", now, now, name=name, epoch=self._plan.epoch)
-            await self._keep(record)
-            self._event("joined", mac, f"{name or mac} joined the network")
-        elif name and known.name != name:
-            await self._keep(replace(known, name=name))
+            return DeviceRecord(mac, "discovered", now, now, name=name, epoch=self._plan.epoch)
+        if device.moved and known.state == "mapped" and known.reason != DOUBTED:
+            return replace(known, name=name, state="waiting", reason=PARTED)
+        return known if known.name == name else replace(known, name=name)
+
+    async def ignore(self, mac: str, *, on: bool) -> None:
+        """Leave a known device alone, or no more; VadError where there is none."""
+        device = await self.roster.change(self._device(mac).mac, ignored=on)
+        if self._ignores(device.mac):
+            self._devices.pop(device.mac, None)
+            self._bus.forget_device(device.mac)
+        elif device.mac not in self._devices:
+            record = await self._store.device(device.mac)
+            if record is not None:
+                self._devices[device.mac] = record
+            await self._describe([device])
+
+    async def rename(self, mac: str, name: str) -> None:
+        """Give a known device a name, an empty one takes it away; VadError where there is no such device."""
+        device = self._device(mac)
+        if listed := self.roster.table.listed_name(device):
+            raise VadError(f"{mac} is called {listed!r} in the settings", remedy="Change it there")
+        device = await self.roster.change(device.mac, name=name)
+        if device.mac in self._devices:
+            await self._describe([device])
+
+    async def forget(self, mac: str) -> None:
+        """Drop a known device and all its walks; when it joins again it is new."""
+        device = await self.roster.forget(self._device(mac).mac)
+        self._drop(device.mac)
+
+    def _drop(self, mac: str) -> None:
+        self._devices.pop(mac, None)
+        self._left_ns.pop(mac, None)
+        self._bus.forget_device(mac)
+
+    def _device(self, mac: str) -> Device:
+        device = self.roster.table.find(normal_mac(mac))
+        if device is None:
+            raise VadError(f"no device with the address {mac} is known", remedy="`vad devices` lists them")
+        return device
+
+    def _ignores(self, mac: str) -> bool:
+        device = self.roster.table.find(mac)
+        return device is not None and self.roster.table.ignores(device)
+
+    def _name(self, mac: str) -> str | None:
+        return self.roster.table.name_of(device) if (device := self.roster.table.find(mac)) else None
 
     async def use_plan(self, plan: FloorPlan, transform: PlanTransform | None, reason: str) -> None:
         """Go on with another floor plan.
@@ -108,8 +216,8 @@ class Registry:
                     await self._keep(moved)
                 continue
             grid = Grid.over(plan.bounds_m, stored.step_m)
-            density = moved_posterior(_posterior(stored), transform, grid).log_density.astype(np.float32)
-            stored = replace(stored, epoch=plan.epoch, bounds_m=_outer_edges(grid), log_posterior=density)
+            density = moved_posterior(posterior_of(stored), transform, grid).log_density.astype(np.float32)
+            stored = replace(stored, epoch=plan.epoch, bounds_m=outer_edges(grid), log_posterior=density)
             await self._keep(moved, stored)
             self._publish_heatmap(stored)
 
@@ -128,7 +236,7 @@ class Registry:
         known = self._devices[mac]
         if known.estimate is None or self._stale(known):
             return "waiting for somebody to walk through the picture"
-        return _another_walk(known.estimate.radius90_m, known.walks)
+        return another_walk(known.estimate.radius90_m, known.walks)
 
     async def capturing(self, mac: str) -> None:
         """A capture of this device has begun."""
@@ -136,11 +244,11 @@ class Registry:
 
     def sends_as(self, mac: str) -> str:
         """The address that the device sends with."""
-        return self._devices[mac].mac
+        return device.current_mac if (device := self.roster.table.find(mac)) else mac
 
     def ip_of(self, mac: str) -> str | None:
         """The device's IPv4 address, where it is known."""
-        return self._addresses.get(mac)
+        return device.ip if (device := self.roster.table.find(mac)) else None
 
     async def known_posterior(self, mac: str, grid: Grid) -> Posterior | None:
         """What all walks so far say together; None where nothing of this map epoch is known."""
@@ -151,6 +259,10 @@ class Registry:
     async def doubt(self, mac: str, *, on: bool) -> None:
         """Say, or say no more, that the last walk contradicts the map."""
         known = self._devices[mac]
+        device = self.roster.table.find(mac)
+        if device is not None and device.moved != on:
+            await self.roster.change(mac, moved=on)
+            self._publish(known)
         if on and known.state == "mapped":
             await self._keep(replace(known, reason=DOUBTED))
         elif not on and known.reason == DOUBTED:
@@ -194,7 +306,10 @@ class Registry:
         walks = 1 if fresh else known.walks + 1
         place = place_from_posterior(joint_posterior(total, walks))
         was_mapped = not anew and known.state == "mapped"
-        state, reason = self._verdict(place, walks, was_mapped, joint_posterior(total, walks))
+        posterior = joint_posterior(total, walks)
+        state, reason = verdict(
+            self._settings.capture, self._plan, place, walks, posterior, was_mapped=was_mapped
+        )
         counts = {} if fresh else known.evidence
         record = replace(
             known,
@@ -212,7 +327,7 @@ class Registry:
         stored = PosteriorRecord(
             mac,
             self._plan.epoch,
-            _outer_edges(total.grid),
+            outer_edges(total.grid),
             total.grid.step_m,
             walks,
             total.log_density.astype(np.float32),
@@ -225,35 +340,6 @@ class Registry:
             self._event("mapped", mac, f"{known.name or mac} is mapped{where}, ±{place.radius90_m:.1f} m")
         return place
 
-    def _verdict(
-        self, place: PlaceEstimate, walks: int, was_mapped: bool, posterior: Posterior
-    ) -> tuple[str, str]:
-        """State and reason after `walks` walks. Where walks of this kind do not make it sharp, a sure room is
-        an answer, too."""
-        capture = self._settings.capture
-        enough_m = capture.mapped_radius_m * (STAYS_MAPPED if was_mapped else 1.0)
-        located = place.status == "located"
-        if located and place.radius90_m <= enough_m and walks >= capture.min_walks:
-            return "mapped", ""
-        if walks < capture.max_walks:
-            return "waiting", _another_walk(place.radius90_m, walks)
-        size = _size(place.radius90_m, walks)
-        room, share = self._likeliest_room(posterior)
-        if located and room == self._plan.room_at(*place.xy_m.tolist()) and share >= SURE_OF_ROOM:
-            return (
-                "mapped",
-                f"{size}: the room is sure to {share:.0%}, more walks of this kind do not tell",
-            )
-        return "failed", f"{size}: more walks of this kind do not tell; walk elsewhere in the picture"
-
-    def _likeliest_room(self, posterior: Posterior) -> tuple[str | None, float]:
-        """The room with the largest share of the posterior, and that share."""
-        shares: dict[str, float] = {}
-        for (x_m, y_m), p in zip(posterior.grid.points_m, posterior.probability.ravel(), strict=True):
-            if p > NEGLIGIBLE and (room := self._plan.room_at(x_m, y_m)) is not None:
-                shares[room] = shares.get(room, 0.0) + float(p)
-        return max(shares.items(), key=lambda item: item[1], default=(None, 0.0))
-
     def _stale(self, record: DeviceRecord) -> str:
         """Why the coordinates of a record no longer hold; empty when they do."""
         if record.estimate is None or record.epoch == self._plan.epoch:
@@ -265,7 +351,7 @@ class Registry:
         stored = await self._store.posterior(known.mac)
         if stored is None or stored.epoch != self._plan.epoch:
             return None
-        before = _posterior(stored)
+        before = posterior_of(stored)
         same = (before.grid.rows, before.grid.columns) == (grid.rows, grid.columns)
         if not same or not np.allclose(before.grid.bounds_m, grid.bounds_m):
             return moved_posterior(before, IDENTITY, grid)  # the plan has grown since
@@ -290,35 +376,15 @@ class Registry:
         self._publish(record)
 
     def _publish(self, record: DeviceRecord) -> None:
-        place = record.estimate
-        located: dict[str, Any] = {}
-        if place is not None:
-            located = {
-                "x_m": place.x_m,
-                "y_m": place.y_m,
-                "covariance_m2": place.covariance_m2,
-                "radius90_m": place.radius90_m,
-                "region90": place.region90,
-                "room": place.room,
-                "method": place.method,
-            }
+        table = self.roster.table
+        device = table.find(record.mac)
+        here = device is not None and table.in_network(device)
         self._bus.publish_device(
-            m.DeviceMessage(
-                source=self._settings.source,
-                mac=record.mac,
-                name=record.name,
-                state=record.state,  # type: ignore[arg-type]  # the store keeps text
-                reason=record.reason,
-                epoch=record.epoch,
-                walks=record.walks,
-                evidence=record.evidence,
-                updated_at=record.updated_at,
-                **located,
-            )
+            device_message(record, device, in_network=here, source=self._settings.source)
         )
 
     def _publish_heatmap(self, stored: PosteriorRecord) -> None:
-        p = joint_posterior(_posterior(stored), stored.walks).probability
+        p = joint_posterior(posterior_of(stored), stored.walks).probability
         self._bus.publish_heatmap(
             m.heatmap_message(
                 p,
@@ -332,24 +398,3 @@ class Registry:
 
     def _event(self, kind: m.EventKind, mac: str, text: str) -> None:
         self._bus.publish_event(m.EventMessage(source=self._settings.source, kind=kind, mac=mac, text=text))
-
-
-def _size(radius90_m: float, walks: int) -> str:
-    return f"±{radius90_m:.1f} m after {walks} walk{'s' if walks > 1 else ''}"
-
-
-def _another_walk(radius90_m: float, walks: int) -> str:
-    return f"{_size(radius90_m, walks)}; another walk through the picture makes it sharper"
-
-
-def _posterior(stored: PosteriorRecord) -> Posterior:
-    rows, columns = stored.log_posterior.shape
-    half = stored.step_m / 2
-    grid = Grid(stored.bounds_m[0] + half, stored.bounds_m[1] + half, stored.step_m, columns, rows)
-    return Posterior(grid, stored.log_posterior.astype(np.float64))
-
-
-def _outer_edges(grid: Grid) -> tuple[float, float, float, float]:
-    x0, y0, x1, y1 = grid.bounds_m
-    half = grid.step_m / 2
-    return x0 - half, y0 - half, x1 + half, y1 + half

@@ -67,5 +67,17 @@ MIGRATIONS: tuple[str, ...] = (
         last_seen TEXT NOT NULL
     ) WITHOUT ROWID;
     """,
+    """
+    CREATE TABLE identities (
+        mac TEXT PRIMARY KEY,
+        macs TEXT NOT NULL,
+        first_seen TEXT NOT NULL,
+        last_seen TEXT NOT NULL,
+        name TEXT, host_name TEXT, client_id TEXT, ip TEXT, vendor TEXT, agent TEXT,
+        ignored INTEGER NOT NULL DEFAULT 0,
+        moved INTEGER NOT NULL DEFAULT 0,
+        shared INTEGER NOT NULL DEFAULT 0
+    ) WITHOUT ROWID;
+    """,
 )
 """Step i leads from version i to i + 1."""

@@ -13,6 +13,7 @@ _TABLES = {
     "epochs": "rowid",
     "cameras": "id",
     "agents": "id",
+    "identities": "mac",
     "devices": "mac",
     "posteriors": "rowid",
     "history": "rowid",

@@ -12,7 +12,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from vad.store import rows
+from vad.devices.device import Device
+from vad.store import identities, rows
 from vad.store.migrations import MIGRATIONS
 from vad.store.opening import (
     StoreError,
@@ -228,6 +229,25 @@ class Store:
                 "SELECT id, info, first_seen, last_seen FROM agents ORDER BY id"
             ).fetchall()
         return [AgentRecord(id_, json.loads(info), first, last) for id_, info, first, last in found]
+
+    def save_identities(self, kept: Iterable[Device], gone: Iterable[str] = ()) -> None:
+        """Write who devices are, and forget those in `gone` (MACs) with all their walks: all or nothing."""
+        with self._transaction() as db:
+            identities.write_identities(db, kept, gone)
+
+    def identities(self) -> list[Device]:
+        """Who the devices are, in order of discovery; a damaged row is left out."""
+        with explained(self.path):
+            found = self._db.execute(
+                f"SELECT {identities.COLUMNS} FROM identities ORDER BY first_seen, mac"
+            ).fetchall()
+        known = []
+        for row in found:
+            try:
+                known.append(identities.read_identity(row))
+            except _DAMAGED_ROW as error:
+                log.warning("%s: %s", self.path, error)
+        return known
 
     def _begin_anew(self, damaged: Path) -> None:
         """Take over what can be read of the damaged file; say what became of it."""

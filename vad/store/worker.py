@@ -16,6 +16,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self, TypeVar
 
+from vad.devices.device import Device
 from vad.health import Health
 from vad.store.records import (
     AgentRecord,
@@ -154,6 +155,14 @@ class StoreWorker:
     async def agents(self) -> list[AgentRecord]:
         """See Store.agents."""
         return await self._call(self._opened().agents)
+
+    async def save_identities(self, kept: Sequence[Device], gone: Sequence[str] = ()) -> None:
+        """See Store.save_identities."""
+        await self._write(partial(self._opened().save_identities, kept, gone))
+
+    async def identities(self) -> list[Device]:
+        """See Store.identities."""
+        return await self._call(self._opened().identities)
 
     def _opened(self) -> Store:
         if self._store is None:
