@@ -132,8 +132,8 @@ CameraSourceSettings = (
 
 
 class CameraSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The camera. id: its name on the bus. intrinsics: a file that `vad camera intrinsics` wrote; or focal_px,
-    if that alone is known; with neither the lens is estimated from the robot's drive."""
+    """The camera. id: its name on the bus. intrinsics: a file that `vad camera intrinsics` wrote; or
+    focal_px, if that alone is known; with neither the lens is estimated from the robot's drive."""
 
     source: CameraSourceSettings
     id: Id = "main"

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from vad.geometry import Intrinsics, Rigid, look_at, project
 from vad.mapping.camera_calibration import CameraCalibration
-from vad.mapping.camera_stage import CameraMapper, best_of_each, spread, spread_selection
+from vad.mapping.camera_spread import best_of_each, spread, spread_selection
+from vad.mapping.camera_stage import CameraMapper
 from vad.mapping.camera_track import PoseTrack
 
 Array = NDArray[np.float64]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from vad.bus.session import check_endpoint, local_endpoints, tls_endpoints
+from vad.camera.lens_file import camera_lens
 from vad.config import Settings, pki_folder, resolve
 from vad.daemon.adapters import camera_source
 from vad.errors import ConfigError
@@ -21,6 +22,7 @@ def check_files(settings: Settings, config_file: Path) -> None:
     if settings.vision.model and not resolve(settings.vision.model, config_file).is_file():
         raise ConfigError("no such file", where=f"{config_file}: $.vision.model")
     camera_source(settings.camera, config_file.parent)
+    camera_lens(settings.camera, config_file.parent)
     check_bus(settings, config_file)
 
 

@@ -6,6 +6,7 @@ import asyncio
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,16 @@ class _Seen:
 
     people: PeopleSeen
     candidates: list[RobotCandidate]
+
+
+def known_calibration(record: dict[str, Any]) -> CameraCalibration | None:
+    """A stored calibration that may be used; None for another state, or what an older version wrote."""
+    try:
+        known = CameraCalibration.from_dict(record)
+    except ValueError as error:
+        _log.warning("the stored calibration of the camera is left out: %s", error)
+        return None
+    return known if known.status == "valid" else None
 
 
 class Eyes:

@@ -17,7 +17,8 @@ from vad.geometry import FloatArray, Intrinsics
 from vad.mapping.camera_calibration import CameraCalibration
 from vad.mapping.camera_consensus import Sightings, consensus
 from vad.mapping.camera_fit import Start, surprise
-from vad.mapping.camera_stage import CameraMapper, best_of_each
+from vad.mapping.camera_spread import best_of_each
+from vad.mapping.camera_stage import CameraMapper, Deviations
 from vad.mapping.camera_track import PoseTrack
 from vad.mapping.camera_view import CameraView
 
@@ -143,6 +144,10 @@ class CameraKeeper:
         elif self.calibration.status != "valid":
             self.calibration = found
         return self.calibration
+
+    def deviations(self) -> Deviations | None:
+        """Robot against camera over what came since the last beginning; None while nothing valid stands."""
+        return self._mapper.deviations(self.calibration)
 
     def _begin_anew(self, why: str, view: CameraView | None) -> None:
         """Forget what belongs to the camera's old place."""

@@ -8,6 +8,7 @@ candidates and poses names the robot, finds the time offset and calibrates the c
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -32,6 +33,7 @@ from vad.mapping.camera_fit import (
     starting_pose,
     surprise,
 )
+from vad.mapping.camera_spread import best_of_each, spread, spread_selection
 from vad.mapping.camera_track import PoseTrack
 
 MIN_PAIRS = 15
@@ -48,7 +50,6 @@ SOLVE_FRAMES = 1200
 _SEARCH_FRAMES = 80
 _KEPT_FRAMES = 6000
 _KEPT_POSES = 60_000
-_CELL_M = 0.25
 _ROUNDS = 4
 # A pair this many standard deviations off is something else.
 _MAX_SURPRISE = 4.0
@@ -58,6 +59,19 @@ _ENOUGH_SIGHTINGS = 100
 # The pose must be known this long around a pair, for its derivative in time.
 _TIME_MARGIN_S = 0.25
 _MOVING_M_S = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Deviations:
+    """Robot against camera. robot_m, camera_m: (N, 2) floor points, map frame; image_px: (N, 2) where it was
+    found, raw; agreeing: share of the pictures that should show the robot in which it was found where it
+    should be; path_m: (M, 2) all of the robot's path."""
+
+    robot_m: FloatArray
+    camera_m: FloatArray
+    image_px: FloatArray
+    agreeing: float
+    path_m: FloatArray
 
 
 class CameraMapper:
@@ -100,9 +114,7 @@ class CameraMapper:
             return CameraCalibration("uncalibrated", 0, "no robot poses have come yet")
         if not self._frames:
             return CameraCalibration("uncalibrated", 0, "nothing has moved in the picture yet")
-        origin_ns = self._poses[0][0]
-        table = np.array([(1e-9 * (t - origin_ns), x, y, s) for t, x, y, s in self._poses])
-        track = PoseTrack(table[:, 0], table[:, 1:3], table[:, 3])
+        track, origin_ns = self._track()
         sightings = self._chosen(track, origin_ns)
         frames = len(np.unique(sightings.frame))
         xy, _ = track.at(sightings.t_s)
@@ -117,6 +129,28 @@ class CameraMapper:
         if fit is None:
             return _no_consensus(frames, 0)
         return self._judge(*fit, track)
+
+    def deviations(self, known: CameraCalibration) -> Deviations | None:
+        """What was collected against a calibration that is not changed by it; None if it has no place."""
+        lens, pose, offset_s = known.intrinsics, known.camera_from_map, known.time_offset_s
+        if lens is None or pose is None or offset_s is None or len(self._poses) < 2 or not self._frames:
+            return None
+        track, origin_ns = self._track()
+        sightings = self._chosen(track, origin_ns)
+        if not len(sightings.frame):
+            return None
+        at = Start(lens, pose, offset_s)
+        pairs = sightings.take(self._named(at, sightings, track))
+        xy, _ = track.at(pairs.t_s + offset_s)
+        found, _ = known.floor_point(pairs.image_px, pairs.sigma_px)
+        return Deviations(
+            xy, found, pairs.image_px, self._share_agreeing(at, pairs, sightings, track), track.xy_m
+        )
+
+    def _track(self) -> tuple[PoseTrack, int]:
+        origin_ns = self._poses[0][0]
+        table = np.array([(1e-9 * (t - origin_ns), x, y, s) for t, x, y, s in self._poses])
+        return PoseTrack(table[:, 0], table[:, 1:3], table[:, 3]), origin_ns
 
     def _chosen(self, track: PoseTrack, origin_ns: int) -> Sightings:
         """At most SOLVE_FRAMES frames, spread evenly over the floor that was driven."""
@@ -316,41 +350,6 @@ class CameraMapper:
         if not unseen:
             return ""
         return f"; the robot has not been seen in the {' and '.join(unseen)} third of the picture"
-
-
-def spread(xy_m: FloatArray) -> tuple[float, float]:
-    """Area of the convex hull, m^2, and the standard deviation across the narrow direction, m, of (N, 2)."""
-    known = xy_m[np.isfinite(xy_m[:, 0])]
-    if len(known) < 3:
-        return 0.0, 0.0
-    width = float(np.sqrt(max(np.linalg.eigvalsh(np.cov(known.T))[0], 0.0)))
-    return float(cv2.contourArea(cv2.convexHull(known.astype(np.float32)))), width
-
-
-def spread_selection(xy_m: FloatArray, limit: int) -> NDArray[np.int64]:
-    """Rows of (N, 2) positions, at most `limit`, taken round-robin from the cells of the floor; NaN left out.
-
-    The first rows are as evenly spread as the whole, so a prefix is a smaller selection.
-    """
-    rows = np.flatnonzero(np.isfinite(xy_m[:, 0]))
-    # A fixed permutation: within a cell early and late visits are taken alike, the same every time.
-    rows = np.random.default_rng(0).permutation(rows)
-    cells = np.floor(xy_m[rows] / _CELL_M).astype(np.int64)
-    _, cell = np.unique(cells, axis=0, return_inverse=True)
-    cell = cell.ravel()
-    order = np.argsort(cell, kind="stable")
-    first = np.searchsorted(cell[order], cell[order])
-    visit = np.empty(len(rows), dtype=np.int64)
-    visit[order] = np.arange(len(rows)) - first
-    return np.asarray(rows[np.argsort(visit, kind="stable")][:limit], dtype=np.int64)
-
-
-def best_of_each(frame: NDArray[np.int64], badness: FloatArray, limit: float) -> NDArray[np.int64]:
-    """Rows of the least bad candidate of every frame, where it is below `limit`; (K,) in, rows out."""
-    order = np.lexsort((np.where(np.isnan(badness), np.inf, badness), frame))
-    _, first = np.unique(frame[order], return_index=True)
-    best = order[first]
-    return np.asarray(best[badness[best] < limit], dtype=np.int64)
 
 
 def _inside(track: PoseTrack, t_s: FloatArray) -> NDArray[np.bool_]:

@@ -175,7 +175,7 @@ def _dock(drive: Drive, begin: FloatArray, rng: np.random.Generator) -> FloatArr
     while True:
         dock = rng.uniform((x0, y0), (x1, y1))
         if np.linalg.norm(dock - begin) > 0.7 and _free(drive, np.array([dock, begin])):
-            return np.asarray(dock[None], dtype=np.float64)
+            return np.array([dock], dtype=np.float64)
 
 
 def _shape(shape: DriveShape, low: FloatArray, size: FloatArray) -> FloatArray:
