@@ -1,4 +1,4 @@
-"""Every kind of camera that the settings know becomes its adapter, and mistakes are refused with their path."""
+"""Every kind of camera in the settings becomes its adapter; mistakes are refused with their path."""
 
 from __future__ import annotations
 

@@ -30,6 +30,7 @@ from vad.config import (
     RtspCameraSettings,
     Settings,
     ValetudoRobot,
+    VisionSettings,
     pki_folder,
 )
 from vad.csi.open_source import open_source
@@ -51,6 +52,8 @@ from vad.robot.ros2_keys import Style
 from vad.robot.ros2_source import Ros2Source, Ros2Topics
 from vad.robot.valetudo_source import ValetudoSource
 from vad.robot.zenoh_source import ZenohPoseSource
+from vad.vision.robot import CandidateFinder, RobotFinder
+from vad.vision.robot_detector import RobotDetector
 
 
 def network_gate(settings: Settings, config_file: Path) -> Gate | None:
@@ -91,6 +94,14 @@ def _topics(robot: Ros2Robot) -> Ros2Topics:
         map_topic=robot.map_topic,
         frames=Frames(robot.map_frame, robot.base_frames),
     )
+
+
+def robot_finder(settings: VisionSettings, base: Path) -> CandidateFinder:
+    """What finds the robot in the picture; relative paths are taken from `base`. Loading takes a moment."""
+    if settings.robot_detector == "motion":
+        return RobotFinder()
+    path = None if settings.robot_detector == "packaged" else base / settings.robot_detector
+    return RobotDetector(path, class_name=settings.robot_class, threads=settings.threads)
 
 
 def camera_source(settings: CameraSettings, base: Path) -> CameraSource:

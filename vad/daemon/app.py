@@ -23,7 +23,14 @@ from vad.camera.frame import Frame
 from vad.camera.lens_file import camera_lens
 from vad.config import Settings, resolve
 from vad.csi.packets import CsiBatch
-from vad.daemon.adapters import camera_source, csi_source, join_sources, network_gate, robot_source
+from vad.daemon.adapters import (
+    camera_source,
+    csi_source,
+    join_sources,
+    network_gate,
+    robot_finder,
+    robot_source,
+)
 from vad.daemon.agents import Agents
 from vad.daemon.captures import Captures
 from vad.daemon.checks import check_listen
@@ -146,6 +153,7 @@ class Daemon:
             lens=await asyncio.to_thread(camera_lens, settings.camera, self._base),
             known=known,
             on_calibration=self._calibrations.put,
+            finder=await asyncio.to_thread(robot_finder, settings.vision, self._base),
         )
         ears = Ears()
         registry = Registry(settings, self._plan, self._bus, self._store)

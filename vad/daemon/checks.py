@@ -7,7 +7,7 @@ from pathlib import Path
 from vad.bus.session import check_endpoint, local_endpoints, tls_endpoints
 from vad.camera.lens_file import camera_lens
 from vad.config import Settings, pki_folder, resolve
-from vad.daemon.adapters import camera_source
+from vad.daemon.adapters import camera_source, robot_finder
 from vad.errors import ConfigError
 from vad.pki.folder import PkiFolder
 from vad.robot.map_server import load_floor_plan, load_rooms
@@ -21,6 +21,7 @@ def check_files(settings: Settings, config_file: Path) -> None:
         load_rooms(resolve(settings.map.rooms, config_file))
     if settings.vision.model and not resolve(settings.vision.model, config_file).is_file():
         raise ConfigError("no such file", where=f"{config_file}: $.vision.model")
+    robot_finder(settings.vision, config_file.parent)
     camera_source(settings.camera, config_file.parent)
     camera_lens(settings.camera, config_file.parent)
     check_bus(settings, config_file)

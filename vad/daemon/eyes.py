@@ -22,7 +22,7 @@ from vad.robot.pose import RobotPose
 from vad.streams import DropOldestQueue
 from vad.vision.movers import LoneMover
 from vad.vision.people import PoseNetwork
-from vad.vision.robot import RobotCandidate, RobotFinder
+from vad.vision.robot import CandidateFinder, RobotCandidate, RobotFinder
 
 _log = logging.getLogger(__name__)
 
@@ -57,6 +57,7 @@ class Eyes:
             picture size of the same shape; focal_px: of a lens of which that alone is known.
         known: a calibration of the same map epoch from an earlier run.
         on_calibration: called on the loop when the calibration changed.
+        finder: finds the robot; by its motion, if left out.
 
     Attributes:
         last_image: the picture of the last frame seen, not to be changed.
@@ -71,6 +72,7 @@ class Eyes:
         lens: Intrinsics | None = None,
         known: CameraCalibration | None,
         on_calibration: Callable[[CameraCalibration], None],
+        finder: CandidateFinder | None = None,
     ) -> None:
         self.health = Health("vision")
         self.calibration = known or CameraCalibration("uncalibrated", 0, "no robot poses have come yet")
@@ -82,7 +84,7 @@ class Eyes:
         self._lens = lens
         self._step_ns = int(0.9e9 / max_fps)
         self._on_calibration = on_calibration
-        self._finder = RobotFinder()
+        self._finder = finder or RobotFinder()
         self._keeper: CameraKeeper | None = None
         self._looked_ns = -LOOK_EVERY_NS
         self._frame_listeners: list[Callable[[int], None]] = []

@@ -7,6 +7,7 @@ poses says (formats.md 11, vad.mapping.camera_stage).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -47,6 +48,14 @@ class RobotCandidate:
     y_px: float
     sigma_px: float
     box: tuple[float, float, float, float]
+
+
+class CandidateFinder(Protocol):
+    """What names places in a picture where the robot may be: by motion, or by a trained network."""
+
+    def update(self, image: NDArray[np.uint8], people_boxes: FloatArray) -> list[RobotCandidate]:
+        """Candidates of the next frame, best first; in people's boxes (N, 4) are none."""
+        ...
 
 
 class RobotFinder:
@@ -113,7 +122,7 @@ def _candidates(moving: NDArray[np.uint8], scale: float, people: FloatArray) -> 
             continue
         # From pixel indices to coordinates: a pixel's middle is its coordinate.
         box = (x * scale - 0.5, y * scale - 0.5, (x + w) * scale - 0.5, (y + h) * scale - 0.5)
-        if _touches(box, people):
+        if touches_people(box, people):
             continue
         x_px, y_px = disc_contact(*box)
         sigma_px = _SIGMA_GRID_PX * scale / 2.0 + _SIGMA_PER_WIDTH * w * scale
@@ -122,8 +131,8 @@ def _candidates(moving: NDArray[np.uint8], scale: float, people: FloatArray) -> 
     return [candidate for _, candidate in found[:MAX_CANDIDATES]]
 
 
-def _touches(box: tuple[float, float, float, float], people: FloatArray) -> bool:
-    """Whether a blob lies in, or reaches into, a person's box with a margin."""
+def touches_people(box: tuple[float, float, float, float], people: FloatArray) -> bool:
+    """Whether a box (x0, y0, x1, y1) lies in, or reaches into, a person's box with a margin."""
     if not len(people):
         return False
     margin = _PERSON_MARGIN * np.maximum(people[:, 2:] - people[:, :2], 0.0)
