@@ -20,6 +20,8 @@ SEARCH_AGAIN_NS = 500_000_000
 # Pieces for one person and for each of two or three; for more the whole picture is cheaper.
 _PIECE_FOR_ONE, _PIECE_FOR_FEW = (256, 192), (192, 128)
 _FOLLOW_AT_MOST = 3
+# Pieces looked at besides a whole picture that does not show all who are known.
+_SEARCH_PIECES = 2
 _CROWD_EVERY_NS = 100_000_000
 # Stamps jitter: what is due within this is done.
 _SLACK_NS = 10_000_000
@@ -71,5 +73,8 @@ class PeopleWatch:
         boxes = np.array([person.box for person in people]).reshape(-1, 4)
         # Who is small or half hidden is seen in a piece of the picture sooner than in all of it.
         missed = [box for box in self._known if not np.any(overlap(np.array(box), boxes) >= SAME_IOU)]
-        self._known = [person.box for person in people] + missed
+        if self._network.takes_any_size:
+            again = [self._network.follow(image, box, _PIECE_FOR_FEW) for box in missed[:_SEARCH_PIECES]]
+            people = distinct(people + [person for person in again if person is not None])
+        self._known = [person.box for person in people]
         return Look(people, True, list(self._known))
