@@ -248,7 +248,7 @@ class CaptureSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
 
 
 class VisionSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """People and the robot in the picture. model: a MoveNet MultiPose ONNX file, else the packaged one.
+    """People and the robot in the picture. model: a MoveNet or YOLO-pose ONNX file, else the packaged one.
 
     robot_detector: `motion` finds the robot by its driving, `packaged` by the network that comes along, a
     path by a YOLOv5, YOLOv8 or YOLOX ONNX file; robot_class: its class there, by name or number, if it has
@@ -258,7 +258,7 @@ class VisionSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     model: str | None = None
     robot_detector: str = "motion"
     robot_class: str | None = None
-    max_fps: Positive = 10.0
+    max_fps: Positive = 15.0
     threads: Annotated[int, Meta(ge=1, le=16)] = 1
 
 
