@@ -300,9 +300,19 @@ def settings_for(folder: Path, quota_mb: int) -> Settings:
     return parse_settings(text, where="bench")
 
 
-def simulate(seed: int, *, days: int = 7, devices: int = 12, quota_mb: int = 200) -> Week:
+def simulate(
+    seed: int,
+    *,
+    days: int = 7,
+    devices: int = 12,
+    quota_mb: int = 200,
+    moved_after_s: float = DAY_S,
+    joined_within_s: float = 1.5 * DAY_S,
+) -> Week:
     """Days of a household with the daemon's default settings."""
-    house = make_household(seed, days=days, devices=devices)
+    house = make_household(
+        seed, days=days, devices=devices, moved_after_s=moved_after_s, joined_within_s=joined_within_s
+    )
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         return asyncio.run(Simulation(house, days, folder, settings_for(folder, quota_mb)).run())

@@ -7,12 +7,13 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 
 import numpy as np
+import pytest
 from daemon_world import settings_for
 
 from vad.bus import messages as m
 from vad.bus.node import Bus
 from vad.bus.session import BusSettings
-from vad.daemon.findings import Findings
+from vad.daemon.findings import DeviceGoneError, Findings
 from vad.daemon.registry import DOUBTED, Registry
 from vad.daemon.solver_child import SolvedWalk
 from vad.mapping.posterior import Grid, Posterior
@@ -128,6 +129,18 @@ async def test_a_first_walk_that_was_wrong_is_dropped_without_an_alarm(tmp_path:
             "begun anew: lamp: its first walks were wrong; mapped, Study"
         )
         assert home.events() == ["joined", "mapped"]
+
+
+async def test_a_device_that_is_forgotten_meanwhile_does_not_come_back(tmp_path: Path) -> None:
+    async with house(tmp_path) as home:
+        await home.walk(STUDY)
+        await home.registry.forget(LAMP)
+        with pytest.raises(DeviceGoneError):
+            await home.walk(STUDY)
+        assert home.registry.all() == []
+        await home.registry.joined(LAMP, "lamp")
+        await home.walk(KITCHEN)
+        assert home.registry.get(LAMP).walks == 1, "nothing of the old place"
 
 
 async def test_a_vague_walk_is_evidence_and_no_contradiction(tmp_path: Path) -> None:

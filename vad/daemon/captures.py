@@ -135,6 +135,9 @@ class Captures:
         return Hearing(per_s, self._traffic.reaches(mac), why)
 
     async def _capture(self, macs: tuple[str, ...], track: int) -> None:
+        macs = tuple(filter(self._registry.knows, macs))
+        if not macs:
+            return
         try:
             walk = await self._begin([self._registry.get(mac) for mac in macs], track)
         except OSError as error:

@@ -12,8 +12,16 @@ from typing import Literal
 from vad.capture.moved import contradicts
 from vad.daemon.registry import Registry
 from vad.daemon.solver_child import SolvedWalk
+from vad.errors import VadError
 from vad.mapping.device_stage import PlaceEstimate, place_from_posterior
 from vad.mapping.posterior import Posterior
+
+
+class DeviceGoneError(VadError):
+    """The device is not known any more."""
+
+    code = "gone"
+
 
 Verdict = Literal["sharper", "contradicts", "moved", "begun anew"]
 
@@ -44,28 +52,40 @@ class Findings:
         """Whether the device's last walk contradicts its map."""
         return mac in self._doubts
 
+    def _still_known(self, mac: str) -> None:
+        if not self._registry.knows(mac):
+            self._doubts.pop(mac, None)
+            raise DeviceGoneError("the device was forgotten meanwhile", where=mac)
+
     async def enough(self, mac: str, posterior: Posterior) -> bool:
         """Whether this much of a walk would leave the device mapped; not where it contradicts the map: what
         it says had better be sure."""
+        self._still_known(mac)
         before = await self._registry.known_posterior(mac, posterior.grid)
         if before is None or contradicts(before, posterior):
             return False
+        self._still_known(mac)
         return await self._registry.would_be_mapped(mac, posterior)
 
     async def take(self, mac: str, walk: SolvedWalk) -> Finding:
-        """Judge a walk that has a posterior, and tell the registry."""
+        """Judge a walk that has a posterior, and tell the registry.
+
+        Raises DeviceGoneError where the device was forgotten, or found to be another one, meanwhile.
+        """
         assert walk.posterior is not None
+        self._still_known(mac)
         name = self._registry.get(mac).name or mac
         before = await self._registry.known_posterior(mac, walk.posterior.grid)
+        self._still_known(mac)
         doubt = self._doubts.pop(mac, None)
         if before is None or not contradicts(before, walk.posterior):
             place = await self._add(mac, walk)
-            await self._registry.doubt(mac, on=False)
+            await self._doubt(mac, on=False)
             passed = "; the walk before that said otherwise is left out" if doubt and before else ""
             return Finding("sharper", place, f"{name}: {self._where(mac, place)}{passed}")
         if doubt is None or doubt.epoch != walk.epoch:
             self._doubts[mac] = _Doubt(walk, walk.epoch)
-            await self._registry.doubt(mac, on=True)
+            await self._doubt(mac, on=True)
             place = place_from_posterior(walk.posterior)
             text = f"{name}: this walk says {self._spot(place)}, the map says {self._spot_of(mac)}: "
             return Finding("contradicts", place, text + "it is measured again before anything is changed")
@@ -82,7 +102,7 @@ class Findings:
         place = await self._add(mac, first if agree else second, anew=True)
         if agree:
             place = await self._add(mac, second)
-        await self._registry.doubt(mac, on=False)
+        await self._doubt(mac, on=False)
         if not mapped:
             return Finding(
                 "begun anew", place, f"{name}: its first walks were wrong; {self._where(mac, place)}"
@@ -93,7 +113,14 @@ class Findings:
 
     async def _add(self, mac: str, walk: SolvedWalk, *, anew: bool = False) -> PlaceEstimate:
         assert walk.posterior is not None
-        return await self._registry.add_evidence(mac, walk.posterior, walk.packets, walk.walk_s, anew=anew)
+        add = self._registry.add_evidence
+        place = await add(mac, walk.posterior, walk.packets, walk.walk_s, anew=anew)
+        self._still_known(mac)
+        return place
+
+    async def _doubt(self, mac: str, *, on: bool) -> None:
+        await self._registry.doubt(mac, on=on)
+        self._still_known(mac)
 
     def _where(self, mac: str, place: PlaceEstimate) -> str:
         record = self._registry.get(mac)

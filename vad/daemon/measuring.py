@@ -20,7 +20,7 @@ from vad.capture.schedule import (
 )
 from vad.config import CaptureSettings
 from vad.daemon.decisions import DecisionLog
-from vad.daemon.findings import Finding, Findings
+from vad.daemon.findings import DeviceGoneError, Finding, Findings
 from vad.daemon.registry import Registry
 from vad.daemon.solver_child import SolvedWalk
 from vad.store.records import DeviceRecord
@@ -77,9 +77,12 @@ class Measuring:
         step = NO_CALIBRATION if view.calibrating else decision.step  # without its many percentages
         self._log.tell(step, lasts=not decision.record)
         for mac, reason in decision.waits.items():
-            record = self._registry.get(mac)
-            if record.state in _WAITING:
+            if not self._registry.knows(mac):
+                continue
+            if self._registry.get(mac).state in _WAITING:
                 await self._registry.wait(mac, reason)
+            if not self._registry.knows(mac):
+                continue
             common = reason in (decision.step, NO_CALIBRATION) or reason.endswith(self._registry.wish(mac))
             if not common:
                 self._log.tell(f"{self.name(mac)} waits: {reason}", mac, lasts=True)
@@ -88,12 +91,12 @@ class Measuring:
     async def capturing(self, macs: Sequence[str]) -> None:
         """A walk for these devices begins; one that is only looked at again stays what it is meanwhile."""
         for mac in macs:
-            if self._registry.get(mac).state in _WAITING:
+            if self._registry.knows(mac) and self._registry.get(mac).state in _WAITING:
                 await self._registry.capturing(mac)
 
     async def void(self, now_ns: int, macs: Sequence[str], reason: str, *, its_fault: bool) -> None:
         """A walk told nothing of these devices."""
-        for mac in macs:
+        for mac in filter(self._registry.knows, macs):
             self._schedule.failed(now_ns, mac, reason, its_fault=its_fault)
             self._log.tell(f"{self.name(mac)}: the walk is void: {reason}", mac)
             if self._registry.get(mac).state in _WAITING:
@@ -105,7 +108,10 @@ class Measuring:
         if reason:
             await self.void(now_ns, (mac,), reason, its_fault=its_fault)
             return None, reason
-        finding = await self.findings.take(mac, walk)
+        try:
+            finding = await self.findings.take(mac, walk)
+        except DeviceGoneError as error:
+            return None, error.what
         self._schedule.measured(now_ns, mac, blurred=self._registry.get(mac).state == "failed")
         self._log.tell(finding.text, mac)
         self._log.health.counters[finding.verdict.replace(" ", "_")] += 1
@@ -113,7 +119,7 @@ class Measuring:
 
     def name(self, mac: str) -> str:
         """What people call the device."""
-        return self._registry.get(mac).name or mac
+        return (self._registry.knows(mac) and self._registry.get(mac).name) or mac
 
     def _candidate(self, record: DeviceRecord, hearing: Hearing) -> Candidate:
         return Candidate(

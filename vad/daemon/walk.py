@@ -23,7 +23,7 @@ from vad.csi.packets import CsiBatch
 from vad.daemon.agents import Agents, Line, RemoteCard
 from vad.daemon.ears import Ears
 from vad.daemon.eyes import Eyes
-from vad.daemon.findings import Findings
+from vad.daemon.findings import DeviceGoneError, Findings
 from vad.daemon.registry import Registry
 from vad.daemon.solver import Solver
 from vad.daemon.threads import to_the_end
@@ -237,12 +237,13 @@ class WalkRecorder:
     async def _look_ahead(self) -> None:
         """Work out now and then which devices this walk would make sharp already."""
         needed = self._limits.min_walks
-        if any(self._registry.get(mac).walks + 1 < needed for mac in self.macs):
+        known = filter(self._registry.knows, self.macs)
+        if any(self._registry.get(mac).walks + 1 < needed for mac in known):
             return  # one more walk is needed, however sharp this one is
         await asyncio.sleep(self._limits.min_s + GONE_S)
         while True:
             for mac, folder in zip(self.macs, self.writer.folders, strict=True):
-                with contextlib.suppress(SessionError):  # it is being written: the next look tells
+                with contextlib.suppress(SessionError, DeviceGoneError):  # the next look tells
                     solved = await self._solver.solve(folder)
                     if solved.posterior is not None and await self._findings.enough(mac, solved.posterior):
                         self._sharp.add(mac)

@@ -117,10 +117,20 @@ class Household:
         return self.plan.room_at(x_m, y_m)
 
 
-def make_household(seed: int, *, days: int = 7, devices: int = 12, moved_after_s: float = DAY_S) -> Household:
-    """A home of four rooms with up to 12 devices: half of them send by themselves, one never answers, one is
-    carried into another room after `moved_after_s`. Two people walk at different times; on the third and the
-    last day a visitor comes along in the evening.
+def make_household(
+    seed: int,
+    *,
+    days: int = 7,
+    devices: int = 12,
+    moved_after_s: float = DAY_S,
+    joined_within_s: float = 1.5 * DAY_S,
+) -> Household:
+    """A home of four rooms with 3 to 12 devices.
+
+    Half of them send by themselves, the last one never answers, the third is carried into another room at
+    `moved_after_s`. They join one after the other from six in the morning of the first day on, all
+    `joined_within_s`. Two people walk at different times; on the third and the last day a visitor comes
+    along in the evening.
     """
     rng = np.random.default_rng([seed, 0x40_0E])
     home = make_home(seed, walks=days * sum(map(len, _HOURS)))
@@ -135,9 +145,9 @@ def make_household(seed: int, *, days: int = 7, devices: int = 12, moved_after_s
             HomeDevice(
                 f"f4:f5:d8:{seed & 0xFF:02x}:00:{number + 1:02x}",
                 _NAMES[number],
-                6.0 * 3600 + 1800.0 * number * (number < 8) + 3 * DAY_S / 2 * (number >= 8),
+                6.0 * 3600 + joined_within_s * (number / devices) ** 2,
                 tuple(where),
-                sends_by_itself=number % 2 == 0,
+                sends_by_itself=number % 2 == 0 and number != devices - 1,
                 answers=number != devices - 1,
             )
         )

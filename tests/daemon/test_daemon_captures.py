@@ -1,0 +1,143 @@
+"""The capture loop at work: several devices in a walk, checks of mapped ones, crashes before, the story."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from daemon_world import true_calibration, until
+from test_daemon_parts import Hub, hub
+
+from vad.camera.folder import Recording
+from vad.camera.frame import Frame
+from vad.capture.archive import CUT_OFF, sessions_in, total_bytes
+from vad.capture.session import SCHEMA, SessionAnchor, SessionDevice, SessionHeader, load_session
+from vad.capture.session_writer import SessionWriter
+from vad.daemon.decisions import read
+from vad.sim.household import Household, Visit, hear, make_household
+from vad.sim.render import Renderer
+from vad.vision.people import PoseNetwork
+
+HOUSE = make_household(1, days=1, devices=4)
+HOME = HOUSE.home
+LAMP, TV = HOUSE.devices[0], HOUSE.devices[1]
+VISIT = HOUSE.visits[0]
+S = 1_000_000_000
+SHORT = {"min_s": 3.0, "max_s": 6.0, "mapped_radius_m": 5.0, "min_walks": 1}
+
+
+@pytest.fixture(scope="module")
+def network() -> PoseNetwork:
+    return PoseNetwork()
+
+
+async def _play(world: Hub, house: Household, visit: Visit, rates: Mapping[str, float]) -> None:
+    """The visit from its third second on, for the eyes and the ears, in real time."""
+    renderer = await asyncio.to_thread(Renderer, replace(house.home, walks=(visit.walk,)))
+    from_s = visit.walk.start_s + 3.0
+    start_ns = time.monotonic_ns() - int(from_s * S)
+    number, t_s = 0, from_s
+    while True:
+        image = await asyncio.to_thread(renderer.frame, t_s)
+        until_s = (time.monotonic_ns() - start_ns) / S
+        batch = await asyncio.to_thread(hear, house, visit, rates, t_s, until_s)
+        arrival_ns = batch.packets.arrival_ns + start_ns
+        world.batches.put(replace(batch, packets=replace(batch.packets, arrival_ns=arrival_ns)))
+        world.frames.put(Frame(start_ns + int(t_s * S), number, image))
+        t_s, number = until_s, number + 1
+        await asyncio.sleep(max(0.0, 0.1 - (time.monotonic_ns() - start_ns) / S + t_s))
+
+
+@asynccontextmanager
+async def playing(world: Hub, rates: Mapping[str, float]) -> AsyncIterator[None]:
+    task = asyncio.create_task(_play(world, HOUSE, VISIT, rates))
+    try:
+        yield
+    finally:
+        task.cancel()
+        with suppress(asyncio.CancelledError):
+            await task
+
+
+@pytest.mark.slow
+async def test_one_walk_measures_two_devices_and_tells_its_story(
+    tmp_path: Path, network: PoseNetwork
+) -> None:
+    limits = SHORT | {"keep_frames": True}
+    async with hub(tmp_path, network, true_calibration(HOME), capture=limits) as world:
+        for device in (LAMP, TV):
+            await world.registry.joined(device.mac, device.name)
+        async with playing(world, {LAMP.mac: 150.0, TV.mac: 150.0}):
+            await until(lambda: world.captures.step.startswith("recording a walk for lamp, tv"), "both", 15)
+            walks = lambda mac: world.registry.get(mac).walks  # noqa: E731
+            await until(lambda: walks(LAMP.mac) == walks(TV.mac) == 1, "both are solved", 30)
+    sessions = sessions_in(tmp_path / "sessions")
+    assert [(s.state, s.name) for s in sessions] == [("done", "lamp"), ("done", "tv")]
+    assert total_bytes(sessions) < 0.6 * sum(s.bytes for s in sessions), "their bytes are shared"
+    for session, device in zip(sessions, (LAMP, TV), strict=True):
+        loaded = load_session(session.folder)
+        assert loaded.header.device == SessionDevice(device.mac, device.name)
+        rate = len(loaded.t_ns) / ((loaded.t_ns[-1] - loaded.t_ns[0]) / S)
+        assert rate == pytest.approx(150, rel=0.15)
+        assert session.result is not None
+        assert session.result.radius90_m is not None
+        frames = list(Recording(session.folder / "frames").frames())
+        assert len(frames) > 15
+        assert frames[0].t_ns >= loaded.t_ns[0] - S
+    told = [line.text for line in read(tmp_path)]
+    for words in ("measuring lamp (new), tv (new)", "s walked: ", "lamp: mapped", "tv: mapped"):
+        assert any(words in line for line in told), (words, told)
+
+
+@pytest.mark.slow
+async def test_a_mapped_device_stays_mapped_while_it_is_looked_at_again(
+    tmp_path: Path, network: PoseNetwork
+) -> None:
+    limits = SHORT | {"recheck_h": 0.0001}
+    async with hub(tmp_path, network, true_calibration(HOME), capture=limits) as world:
+        await world.registry.joined(LAMP.mac, "lamp")
+        states = set()
+        async with playing(world, {LAMP.mac: 200.0}):
+            await until(lambda: world.registry.get(LAMP.mac).state == "mapped", "it is mapped", 30)
+
+            def checked() -> bool:
+                states.add(world.registry.get(LAMP.mac).state)
+                return "recording" in world.captures.step
+
+            await until(checked, "it is measured again", 20)
+        assert states == {"mapped"}
+
+
+async def test_what_a_crash_cut_off_is_said_at_the_next_start(tmp_path: Path, network: PoseNetwork) -> None:
+    name = "20260301T120000.000-f4f5d8000001"
+    header = SessionHeader(
+        schema=SCHEMA, id=name, source="simulated", device=SessionDevice(), anchor=SessionAnchor(0, 0)
+    )
+    writer = SessionWriter(tmp_path / "sessions" / name, header)
+    before = sessions_in(tmp_path / "sessions")
+    assert before[0].state == "recording"
+    async with hub(tmp_path, network, true_calibration(HOME)) as world:
+        await until(lambda: world.captures.step != "starting", "it has tidied up")
+    (after,) = sessions_in(tmp_path / "sessions")
+    assert (after.state, after.reason) == ("aborted", CUT_OFF)
+    assert any("was cut off" in line.text for line in read(tmp_path))
+    writer.abort("test over")
+
+
+async def test_a_full_quota_takes_the_oldest_at_the_start(tmp_path: Path, network: PoseNetwork) -> None:
+    archive = tmp_path / "sessions"
+    for minute in range(3):
+        folder = archive / f"20260301T12{minute:02d}00.000-f4f5d8000001"
+        folder.mkdir(parents=True)
+        (folder / "session.json").write_text(json.dumps({"capture": {"state": "done"}}))
+        (folder / "csi.dat").write_bytes(bytes(4_500_000))
+    async with hub(tmp_path, network, true_calibration(HOME), capture={"quota_mb": 10}) as world:
+        await until(lambda: world.captures.step != "starting", "it has tidied up")
+    assert [s.id[9:13] for s in sessions_in(archive)] == ["1201", "1202"]
+    assert any("1 old sessions deleted" in line.text for line in read(tmp_path))
