@@ -79,6 +79,10 @@ class Registry:
             if posterior is not None:
                 self._publish_heatmap(posterior)
 
+    def knows(self, mac: str) -> bool:
+        """Whether the device is there: any may be forgotten, ignored or found to be another at any time."""
+        return mac in self._devices
+
     def get(self, mac: str) -> DeviceRecord:
         """The record of a known device."""
         return self._devices[mac]
@@ -371,9 +375,12 @@ class Registry:
         )
 
     async def _keep(self, record: DeviceRecord, posterior: PosteriorRecord | None = None) -> None:
+        if record.mac not in self._devices:
+            return  # it was forgotten meanwhile, and is not to come back by this
         await self._store.save_device(record, posterior)
-        self._devices[record.mac] = record
-        self._publish(record)
+        if record.mac in self._devices:
+            self._devices[record.mac] = record
+            self._publish(record)
 
     def _publish(self, record: DeviceRecord) -> None:
         table = self.roster.table
