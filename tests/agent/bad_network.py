@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import random
+import sys
 from collections.abc import AsyncIterator
 
 PIECE_BYTES = 1 << 16
@@ -94,3 +95,17 @@ class BadNetwork:
             delivering.cancel()
             with contextlib.suppress(asyncio.CancelledError, OSError):
                 await delivering
+
+
+async def _obey(target_port: int, share: float, up_to_s: float) -> None:
+    """A process of its own: prints its port, obeys `cut` and `mend` on standard input until that ends."""
+    network = BadNetwork(target_port, share=share, up_to_s=up_to_s)
+    loop = asyncio.get_running_loop()
+    async with network.running():
+        print(network.port, flush=True)  # noqa: T201 - told to who started it
+        while word := await loop.run_in_executor(None, sys.stdin.readline):
+            network.cut() if word.strip() == "cut" else network.mend()
+
+
+if __name__ == "__main__":
+    asyncio.run(_obey(int(sys.argv[1]), float(sys.argv[2]), float(sys.argv[3])))

@@ -23,7 +23,8 @@ STALL_NS = 5_000_000_000
 KEPT_SESSIONS = 16
 HEARTBEAT_NS = 2_000_000_000
 """A stream without packets says this often that it goes on."""
-NO_CLOCK = "its clock has not been compared with the hub's yet"
+CLOCK_ERROR_NS = 10_000_000
+"""A walker moves a centimetre in this time: with a worse clock no session is begun."""
 
 
 class Collector:
@@ -105,8 +106,17 @@ class Collector:
             follower = self._follow(command.session)
         hub_ns = self._hub_ns(now_ns)
         self._say(follower.receive(command, hub_ns), now_ns)
-        if follower.state == "armed" and (trouble := self._trouble or ("" if self.clock.known else NO_CLOCK)):
+        if follower.state == "armed" and (trouble := self._trouble or self._clock_trouble(now_ns)):
             self._say(follower.give_up(trouble, hub_ns), now_ns)
+
+    def _clock_trouble(self, now_ns: int) -> str:
+        """Why times are not good enough for a session; empty where they are."""
+        if not self.clock.known:
+            return "its clock has not been compared with the hub's yet"
+        error_ns = self.clock.error_ns(now_ns)
+        if error_ns <= CLOCK_ERROR_NS:
+            return ""
+        return f"its clock is only known to {error_ns / 1e6:.0f} ms: the network delays too much"
 
     def _follow(self, session: str) -> Follower:
         while len(self._followers) >= KEPT_SESSIONS:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from vad.capture.handshake import Abort, Answer, Going, Message, Start, Stop
 from vad.errors import ProtocolError, VadError
+from vad.limits import UNREADABLE
 from vad.mac import mac_from_text
 
 VERSION = 1
@@ -109,7 +110,7 @@ def decode_frame(payload: bytes) -> Frame:
     try:
         frame = _frames.decode(payload)
         mac_from_text(frame.mac)
-    except (msgspec.MsgspecError, VadError) as error:
+    except (*UNREADABLE, VadError) as error:
         raise ProtocolError(f"not a frame ({error})") from error
     if frame.version != VERSION:
         raise ProtocolError(f"a frame of version {frame.version}, this hub reads {VERSION}")
@@ -129,7 +130,7 @@ def decode_command(payload: bytes) -> Command:
         raise ProtocolError("a command is too long")
     try:
         return _commands.decode(payload)
-    except msgspec.MsgspecError as error:
+    except UNREADABLE as error:
         raise ProtocolError(f"not a command ({error})") from error
 
 
@@ -142,5 +143,5 @@ def decode_time(payload: bytes) -> HubTime:
     """The inverse; ProtocolError for anything else."""
     try:
         return msgspec.json.decode(payload, type=HubTime)
-    except msgspec.MsgspecError as error:
+    except UNREADABLE as error:
         raise ProtocolError(f"not a time ({error})") from error

@@ -8,6 +8,7 @@ import msgspec
 from msgspec import Meta
 
 from vad.errors import ProtocolError, VadError
+from vad.limits import UNREADABLE
 from vad.mac import normal_mac
 
 SCHEMA = "vad.agent/1"
@@ -42,7 +43,7 @@ def decode_info(payload: bytes) -> AgentInfo:
         raise ProtocolError("an agent's description is too long")
     try:
         info = msgspec.json.decode(payload, type=AgentInfo)
-    except msgspec.MsgspecError as error:
+    except UNREADABLE as error:
         raise ProtocolError(f"not an agent's description ({error})") from error
     if info.schema != SCHEMA:
         raise ProtocolError(f"unknown schema {info.schema!r}")

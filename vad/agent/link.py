@@ -16,6 +16,7 @@ from zenoh import handlers
 from vad.agent.collector import Collector
 from vad.agent.frames import FRAME_ENCODING, MAX_COMMAND_BYTES, decode_command, decode_time
 from vad.agent.info import ENCODING, AgentInfo, encode_info
+from vad.bus.closing import close_in_time
 from vad.bus.keys import HubKeys
 from vad.bus.session import BusSettings, open_session
 from vad.errors import ProtocolError, VadError
@@ -29,9 +30,10 @@ RETRY_LAST_S = 30.0
 """Between tries where no hub answers; once it has answered, zenoh comes back by itself."""
 LOOK_S = 0.25
 """How often the outbox is looked at where nothing wakes the sender: for what has to be sent again."""
-CLOCK_FIRST = 20
-CLOCK_FIRST_EVERY_S = 0.02
-CLOCK_EVERY_S = 0.5
+CLOCK_FIRST = 50
+CLOCK_OFTEN_S = 0.1
+"""How often the hub's clock is asked at first, and in a session."""
+CLOCK_EVERY_S = 1.0
 CLOCK_TIMEOUT_S = 4.0
 COMMANDS = Intake(max_bytes=MAX_COMMAND_BYTES, per_s=200.0, burst=200)
 
@@ -80,12 +82,12 @@ class HubLink:
         except asyncio.CancelledError:
             # A session that opens after all must not live on unseen.
             with contextlib.suppress(VadError):
-                await _close(await opening)
+                await close_in_time(await opening)
             raise
         try:
             yield session
         finally:
-            await _close(session)
+            await close_in_time(session)
 
     async def _linked(self, session: zenoh.Session) -> None:
         loop = asyncio.get_running_loop()
@@ -138,7 +140,8 @@ class HubLink:
             congestion_control=zenoh.CongestionControl.BLOCK,
             priority=zenoh.Priority.DATA_HIGH,
         )
-        with ThreadPoolExecutor(1, thread_name_prefix="vad-agent-put") as thread:
+        thread = ThreadPoolExecutor(1, thread_name_prefix="vad-agent-put")
+        try:
             while True:
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(LOOK_S):
@@ -153,17 +156,19 @@ class HubLink:
                     except zenoh.ZError as error:
                         self._trouble(f"a frame could not be sent: {error}")
                         break
+        finally:
+            thread.shutdown(wait=False, cancel_futures=True)  # what hangs in a put ends in BLOCK_WAIT_US
 
     async def _compare_clocks(self, session: zenoh.Session) -> None:
         while True:
             await self._met.wait()
             self._met.clear()
-            for _ in range(CLOCK_FIRST):
-                self._ask_clock(session)
-                await asyncio.sleep(CLOCK_FIRST_EVERY_S)
+            asked = 0
             while self._hub_there and not self._met.is_set():
                 self._ask_clock(session)
-                await asyncio.sleep(CLOCK_EVERY_S)
+                asked += 1
+                often = asked < CLOCK_FIRST or self._collector.recording
+                await asyncio.sleep(CLOCK_OFTEN_S if often else CLOCK_EVERY_S)
 
     def _ask_clock(self, session: zenoh.Session) -> None:
         loop = asyncio.get_running_loop()
@@ -229,8 +234,3 @@ class HubLink:
     def _trouble(self, reason: str) -> None:
         level = logging.WARNING if self.health.trouble(reason) else logging.DEBUG
         log.log(level, "%s", reason)
-
-
-async def _close(session: zenoh.Session) -> None:
-    with contextlib.suppress(zenoh.ZError):
-        await asyncio.to_thread(session.close)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -25,6 +24,7 @@ from zenoh import handlers
 from vad.bus import messages as m
 from vad.bus.answers import Answerer, Later, NoHistoryError, Past, Reply, answerers
 from vad.bus.board import PNG_ENCODING, Board, Entry, entry_of, raw_entry
+from vad.bus.closing import close_in_time
 from vad.bus.keys import ANY, HubKeys
 from vad.bus.schemas import SCHEMA_ENCODING, json_schemas
 from vad.bus.selectors import SelectorError
@@ -35,7 +35,6 @@ from vad.wall import now_rfc3339 as now_rfc3339  # where publishers look for it
 
 log = logging.getLogger(__name__)
 
-CLOSE_TIMEOUT_S = 0.8
 KEPT_CAPTURES = 32
 """Captures a query still finds; older ones are forgotten."""
 MAX_LATER = 64
@@ -46,30 +45,6 @@ class BusyError(VadError):
     """More is asked than can be answered now."""
 
     code = "busy"
-
-
-async def _close_in_time(session: zenoh.Session) -> None:
-    """Close `session`; leave it to the process's end where a reader that stopped reading holds it up.
-
-    zenoh tries for 10 s to say goodbye on such a link. The thread is a daemon one, so that it cannot hold up
-    the end of the process.
-    """
-    loop = asyncio.get_running_loop()
-    closed = asyncio.Event()
-
-    def close() -> None:
-        try:
-            session.close()  # type: ignore[no-untyped-call]
-        except zenoh.ZError as error:
-            log.debug("closing: %s", error)
-        with suppress(RuntimeError):  # the loop ended before: nobody waits any more
-            loop.call_soon_threadsafe(closed.set)
-
-    threading.Thread(target=close, name="vad-bus-close", daemon=True).start()
-    try:
-        await asyncio.wait_for(closed.wait(), CLOSE_TIMEOUT_S)
-    except TimeoutError:
-        log.warning("zenoh did not close within %s s: a client does not read", CLOSE_TIMEOUT_S)
 
 
 class Bus:
@@ -115,7 +90,7 @@ class Bus:
         self.health.ok(f"listening on {', '.join(self._settings.listen)}")
 
     async def close(self) -> None:
-        """Take everything back, in CLOSE_TIMEOUT_S at most; safe to call twice."""
+        """Take everything back, in vad.bus.closing.CLOSE_TIMEOUT_S at most; safe to call twice."""
         session, self._session = self._session, None
         self._token = None
         waiting = set(self._later)
@@ -124,7 +99,7 @@ class Bus:
         if waiting:
             await asyncio.wait(waiting)
         if session is not None:
-            await _close_in_time(session)
+            await close_in_time(session)
 
     async def __aenter__(self) -> Self:
         await self.open()
