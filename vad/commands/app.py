@@ -7,6 +7,7 @@ import typer
 from vad import __version__
 from vad.commands import loading
 from vad.commands.agent import agent
+from vad.commands.camera import app as camera_app
 from vad.commands.csi import csi_app
 from vad.commands.demo import demo
 from vad.commands.devices import devices
@@ -55,6 +56,7 @@ app.add_typer(sessions_app, name="sessions")
 app.command()(demo)
 app.command()(sim)
 app.command()(doctor)
+app.add_typer(camera_app, name="camera")
 app.add_typer(csi_app, name="csi")
 app.add_typer(robot_app, name="robot")
 app.add_typer(pki_app, name="pki")

@@ -17,6 +17,7 @@ from vad.geometry import Intrinsics
 from vad.health import Health
 from vad.mapping.camera_calibration import CameraCalibration
 from vad.mapping.camera_keeper import LOOK_EVERY_NS, CameraKeeper
+from vad.mapping.camera_stage import Deviations
 from vad.mapping.walk import WalkTrack
 from vad.robot.pose import RobotPose
 from vad.streams import DropOldestQueue
@@ -58,6 +59,7 @@ class Eyes:
         known: a calibration of the same map epoch from an earlier run.
         on_calibration: called on the loop when the calibration changed.
         finder: finds the robot; by its motion, if left out.
+        fixed: only compare with the known calibration, never replace it.
 
     Attributes:
         last_image: the picture of the last frame seen, not to be changed.
@@ -73,6 +75,7 @@ class Eyes:
         known: CameraCalibration | None,
         on_calibration: Callable[[CameraCalibration], None],
         finder: CandidateFinder | None = None,
+        fixed: bool = False,
     ) -> None:
         self.health = Health("vision")
         self.calibration = known or CameraCalibration("uncalibrated", 0, "no robot poses have come yet")
@@ -82,6 +85,7 @@ class Eyes:
         self._walkers = Walkers(network)
         self._focal_px = focal_px
         self._lens = lens
+        self._fixed = fixed
         self._step_ns = int(0.9e9 / max_fps)
         self._on_calibration = on_calibration
         self._finder = finder or RobotFinder()
@@ -93,6 +97,15 @@ class Eyes:
         self._robot_moved_ns = -ROBOT_RESTS_AFTER_NS
         self._solved_ns = 0
         self._new_evidence = False
+
+    @property
+    def robot_moves(self) -> bool:
+        """Whether the robot drove within the last seconds before the last frame."""
+        return self.last_frame_ns - self._robot_moved_ns < ROBOT_RESTS_AFTER_NS
+
+    def deviations(self) -> Deviations | None:
+        """Robot against camera over what has been collected; None while nothing valid stands."""
+        return None if self._keeper is None else self._keeper.deviations()
 
     def listen(self, listener: Callable[[int], None]) -> Callable[[], None]:
         """Call `listener(t_ns)` for every frame seen; returns the way to stop that."""
@@ -187,7 +200,7 @@ class Eyes:
             self._looked_ns = frame.t_ns
             if await asyncio.to_thread(keeper.look, frame.t_ns, frame.image):
                 _log.warning("%s", keeper.calibration.reason)
-        if self._new_evidence and frame.t_ns - self._solved_ns > SOLVE_EVERY_NS:
+        if self._new_evidence and not self._fixed and frame.t_ns - self._solved_ns > SOLVE_EVERY_NS:
             self._solved_ns = frame.t_ns
             self._new_evidence = False
             await asyncio.to_thread(keeper.solve, frame.t_ns)

@@ -186,7 +186,8 @@ def _shape(shape: DriveShape, low: FloatArray, size: FloatArray) -> FloatArray:
     if shape == "rectangle":
         return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]])
     angle = np.linspace(0.0, 2 * np.pi, 41)
-    return low + 0.5 * size + 0.5 * size.min() * np.column_stack([np.cos(angle), np.sin(angle)])
+    ring = 0.5 * size.min() * np.column_stack([np.cos(angle), np.sin(angle)])
+    return np.asarray(low + 0.5 * size + ring, dtype=np.float64)
 
 
 def _random_corners(drive: Drive, rng: np.random.Generator) -> FloatArray:
