@@ -68,18 +68,17 @@ def walk(seed: int, fps: float = FPS) -> Walked:
         if not _in_room(scenario, float(t_s)):
             continue
         result.frames += 1
-        look = watch.look(renderer.frame(float(t_s)), int(t_s * 1e9))
+        image = renderer.frame(float(t_s))
+        look = watch.look(image, int(t_s * 1e9))
         if not look.looked:
             continue
-        found = [standing(person, (640, 480), camera) for person in look.people]
+        found = [standing(person, image, camera) for person in look.people]
         seen = [place for place in found if isinstance(place, Standing)]
         result.shown += bool(seen)
         for place in found:
             result.seen[_how(place)] += 1
         places += [(float(t_s), place.xy_m) for place in seen]
-        xy = np.array([place.xy_m for place in seen]).reshape(-1, 2)
-        spread = np.array([place.covariance_m2 for place in seen]).reshape(-1, 2, 2)
-        tracker.update(int(t_s * 1e9), xy, spread, [place.body for place in seen])
+        tracker.update(int(t_s * 1e9), seen)
     for track in tracker.tracks():
         if sum(body is not None for body in track.bodies) >= MIN_BODIES:
             result.pieces += 1
@@ -173,12 +172,10 @@ def cost(seed: int, seconds: float, *, idle: bool) -> Cost:
         decoded, arrived = time.process_time(), time.perf_counter()
         t_ns = int((begin_s + k / FPS) * 1e9)
         look = watch.look(image, t_ns)
-        found = [standing(person, (640, 480), camera) for person in look.people]
+        found = [standing(person, image, camera) for person in look.people]
         seen = [place for place in found if isinstance(place, Standing)]
         if look.looked:
-            xy = np.array([place.xy_m for place in seen]).reshape(-1, 2)
-            spread = np.array([place.covariance_m2 for place in seen]).reshape(-1, 2, 2)
-            tracker.update(t_ns, xy, spread, [place.body for place in seen])
+            tracker.update(t_ns, seen)
         if k >= warm:
             waits.append(1e3 * (time.perf_counter() - arrived))
             works.append(1e3 * (time.process_time() - decoded))

@@ -61,15 +61,12 @@ def follow_video(console: Console, path: str, frames: int, picture: str | None) 
         if not ok:
             break
         image, t_ns = np.asarray(frame, dtype=np.uint8), int(k / FPS * 1e9)
-        height, width = image.shape[:2]
         look = watch.look(image, t_ns)
         if not look.looked:
             continue
-        found = [standing(person, (width, height), camera) for person in look.people]
+        found = [standing(person, image, camera) for person in look.people]
         seen = [place for place in found if isinstance(place, Standing)]
-        xy = np.array([place.xy_m for place in seen]).reshape(-1, 2)
-        spread = np.array([place.covariance_m2 for place in seen]).reshape(-1, 2, 2)
-        tracker.update(t_ns, xy, spread, [place.body for place in seen])
+        tracker.update(t_ns, seen)
         tracks |= {track.id: track for track in tracker.tracks()}
     if image is None:
         console.print(f"{path} cannot be read: apt-get install opencv-doc brings vtest.avi")

@@ -190,13 +190,11 @@ def test_through_the_real_network_a_rendered_walkers_path_holds_its_bar(seed: in
     walk = scenario.walks[0]
     for t_s in np.arange(walk.start_s, walk.end_s, 1 / RATE_HZ):
         t_ns = int(t_s * 1e9)
-        look = watch.look(renderer.frame(t_s), t_ns)
-        found = [standing(person, (640, 480), camera) for person in look.people]
-        seen = [place for place in found if isinstance(place, Standing)]
-        xy = np.array([place.xy_m for place in seen]).reshape(-1, 2)
-        spread = np.array([place.covariance_m2 for place in seen]).reshape(-1, 2, 2)
+        image = renderer.frame(t_s)
+        look = watch.look(image, t_ns)
+        found = [standing(person, image, camera) for person in look.people]
         if look.looked:
-            tracker.update(t_ns, xy, spread, [place.body for place in seen])
+            tracker.update(t_ns, [place for place in found if isinstance(place, Standing)])
     track = max(tracker.tracks(), key=lambda one: len(one.t_ns))
     path = smooth(track, camera)
     truth = np.array([(s.x_m, s.y_m) for t in path.t_ns if (s := walk.state(t * 1e-9)) is not None])

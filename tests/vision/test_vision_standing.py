@@ -15,7 +15,7 @@ from vad.vision.ground import Refusal
 from vad.vision.people import Person
 from vad.vision.standing import Standing, standing
 
-SIZE = (640, 480)
+PICTURE = np.zeros((480, 640, 3), np.uint8)
 CAMERA = Camera(Intrinsics(640, 480, 410, 410, 320, 240), look_at((0, 0, 2.2), (3, 3, 0.5)))
 
 
@@ -42,7 +42,7 @@ places = st.tuples(st.floats(2.0, 3.6), st.floats(2.0, 3.6))
 
 @given(places, st.floats(1.5, 1.95))
 def test_feet_in_sight_say_where_somebody_stands(place: tuple[float, float], height_m: float) -> None:
-    found = standing(person_at(place, height_m), SIZE, CAMERA)
+    found = standing(person_at(place, height_m), PICTURE, CAMERA)
     assert isinstance(found, Standing)
     assert found.by_feet
     assert found.xy_m == pytest.approx(place, abs=0.04)
@@ -54,7 +54,7 @@ def test_behind_furniture_the_trunk_and_the_usual_stature_do(
 ) -> None:
     height_m = 1.70 + 0.10 * sigmas
     seen, hidden = person_at(place, height_m), rescored(person_at(place, height_m), {15: 0.08, 16: 0.1})
-    by_trunk, by_feet = standing(hidden, SIZE, CAMERA), standing(seen, SIZE, CAMERA)
+    by_trunk, by_feet = standing(hidden, PICTURE, CAMERA), standing(seen, PICTURE, CAMERA)
     assert isinstance(by_trunk, Standing)
     assert isinstance(by_feet, Standing)
     assert not by_trunk.by_feet
@@ -70,7 +70,7 @@ def test_feet_that_contradict_the_trunk_are_not_believed() -> None:
     keypoints = person.keypoints.copy()
     keypoints[[15, 16], 1] -= 60  # ankles "found" on the edge of the sofa in front
     wrong = replace(person, keypoints=keypoints, box=(*person.box[:3], person.box[3] - 60))
-    found = standing(wrong, SIZE, CAMERA)
+    found = standing(wrong, PICTURE, CAMERA)
     assert isinstance(found, Standing)
     assert not found.by_feet
     assert found.xy_m == pytest.approx((2.5, 2.5), abs=0.2)
@@ -79,16 +79,16 @@ def test_feet_that_contradict_the_trunk_are_not_believed() -> None:
 def test_feet_outside_the_picture_are_refused_though_the_trunk_is_seen() -> None:
     person = person_at((2.5, 2.5))
     cut = replace(person, box=(*person.box[:3], 478.0))
-    assert standing(cut, SIZE, CAMERA) == Refusal("feet cut off by the picture's lower edge")
+    assert standing(cut, PICTURE, CAMERA) == Refusal("feet cut off by the picture's lower edge")
 
 
 def test_who_shows_neither_feet_nor_trunk_has_no_place() -> None:
     ghost = rescored(person_at((2.5, 2.5)), dict.fromkeys(range(17), 0.05))
-    assert standing(ghost, SIZE, CAMERA) == Refusal("no ankle seen")
+    assert standing(ghost, PICTURE, CAMERA) == Refusal("no ankle seen")
 
 
 def test_without_a_trunk_the_feet_are_enough_but_there_is_no_body() -> None:
-    found = standing(rescored(person_at((2.5, 2.5)), {5: 0.05}), SIZE, CAMERA)
+    found = standing(rescored(person_at((2.5, 2.5)), {5: 0.05}), PICTURE, CAMERA)
     assert isinstance(found, Standing)
     assert found.by_feet
     assert found.body is None

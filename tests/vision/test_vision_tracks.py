@@ -8,13 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vad.vision.movers import lone_mover, moving
+from vad.vision.standing import Standing
 from vad.vision.tracks import FloatArray, Track, Tracker
 
 RATE_HZ = 15.0
 
 
-def covariance(sigma_m: float, count: int = 1) -> FloatArray:
-    return np.repeat(np.eye(2)[None] * sigma_m**2, count, axis=0)
+def standing_at(points: FloatArray, sigma_m: float = 0.08) -> list[Standing]:
+    return [Standing(point, np.eye(2) * sigma_m**2, None, True) for point in points]
 
 
 def run(tracker: Tracker, places: list[FloatArray], sigma_m: float = 0.08, start_s: float = 1.0) -> int:
@@ -22,7 +23,7 @@ def run(tracker: Tracker, places: list[FloatArray], sigma_m: float = 0.08, start
     t_ns = 0
     for k, points in enumerate(places):
         t_ns = int((start_s + k / RATE_HZ) * 1e9)
-        tracker.update(t_ns, points, covariance(sigma_m, len(points)))
+        tracker.update(t_ns, standing_at(points, sigma_m))
     return t_ns
 
 
@@ -44,6 +45,28 @@ def test_two_crossing_walkers_keep_their_identities(seed: int) -> None:
     alone = lone_mover(tracker.tracks(), end_ns)
     assert alone is not None
     assert alone.probability < 0.01
+
+
+@pytest.mark.parametrize("turns", [False, True])
+def test_two_who_meet_and_turn_back_are_told_apart_by_their_clothes(turns: bool) -> None:
+    """They stand together for 2 s as one blob of places; only the colours tell who leaves to which side."""
+    rng = np.random.default_rng(4)
+    dark, jeans = np.array([20.0, 130, 128, 5, 128, 128]), np.array([25.0, 130, 128, 95, 128, 115])
+    tracker = Tracker()
+    t = np.arange(0, 8, 1 / RATE_HZ)
+    come, go = np.clip(3.0 - t, 0.0, 3.0), np.clip(t - 5.0, 0.0, 3.0)
+    left = -(come + go) if turns else -come + go
+    for k, s in enumerate(t):
+        places = np.array([[left[k], 0.0], [-left[k], 0.02]]) + rng.normal(0, 0.08, (2, 2))
+        people = [
+            Standing(place, np.eye(2) * 0.08**2, None, True, colour + rng.normal(0, 5, 6))
+            for place, colour in zip(places, (dark, jeans), strict=True)
+        ]
+        tracker.update(int((1 + s) * 1e9), people[:: rng.choice([-1, 1])])
+    first, second = tracker.tracks()
+    for track in (first, second):
+        stays = np.sign(track.xy_m[0, 0]) == np.sign(track.xy_m[-1, 0])
+        assert stays == turns
 
 
 def test_six_people_at_once_keep_their_identities() -> None:
@@ -79,16 +102,16 @@ def test_a_track_survives_a_short_gap_and_ends_after_a_long_one() -> None:
     end_ns = run(tracker, [*path, *[empty] * 12, *after])
     (track,) = tracker.tracks()
     assert not track.ended
-    tracker.update(end_ns + 1_600_000_000, empty, np.zeros((0, 2, 2)))
+    tracker.update(end_ns + 1_600_000_000, [])
     (track,) = tracker.tracks()
     assert track.ended
     # After a pause of the frames themselves a newcomer is a new person, even at the old one's place.
     later_ns = end_ns + 9_000_000_000
     for k in range(4):
-        tracker.update(later_ns + k * 66_000_000, track.xy_m[-1:], covariance(0.08))
+        tracker.update(later_ns + k * 66_000_000, standing_at(track.xy_m[-1:]))
     assert [x.id for x in tracker.tracks() if not x.ended] != [track.id]
-    tracker.update(later_ns + 200_000_000_000, empty, np.zeros((0, 2, 2)))
-    tracker.update(later_ns + 400_000_000_000, empty, np.zeros((0, 2, 2)))
+    tracker.update(later_ns + 200_000_000_000, [])
+    tracker.update(later_ns + 400_000_000_000, [])
     assert tracker.tracks() == []
 
 
@@ -170,7 +193,7 @@ def test_points_at_infinity_are_left_out_and_time_goes_forwards() -> None:
     run(tracker, [np.array([[np.nan, 1.0], [1.0, 1.0]])] * 4)
     assert len(tracker.tracks()) == 1
     with pytest.raises(ValueError, match="order of time"):
-        tracker.update(0, np.zeros((0, 2)), np.zeros((0, 2, 2)))
+        tracker.update(0, [])
 
 
 @settings(max_examples=40, deadline=None)

@@ -57,8 +57,7 @@ class Walkers:
         camera = _camera(calibration)
         if camera is None:
             return PeopleSeen(look, False, [], [])
-        height, width = frame.image.shape[:2]
-        found = [standing(person, (width, height), camera) for person in look.people]
+        found = [standing(person, frame.image, camera) for person in look.people]
         places = [place for place in found if isinstance(place, Standing)]
         return PeopleSeen(look, True, places, [place for place in found if isinstance(place, Refusal)])
 
@@ -67,9 +66,7 @@ class Walkers:
         if not (seen.placed and seen.look.looked):
             return
         self._unplaced = len(seen.refused)
-        xy_m = np.array([place.xy_m for place in seen.places]).reshape(-1, 2)
-        covariance = np.array([place.covariance_m2 for place in seen.places]).reshape(-1, 2, 2)
-        self._tracker.update(t_ns, xy_m, covariance, [place.body for place in seen.places])
+        self._tracker.update(t_ns, seen.places)
 
     def forget(self) -> None:
         """Begin anew: the map or the camera's place changed."""

@@ -24,8 +24,9 @@ from vad.vision.body import (
     Camera,
     body_of,
 )
+from vad.vision.clothes import clothes
 from vad.vision.ground import GroundPoint, Refusal, feet_cut, ground_point
-from vad.vision.people import Person
+from vad.vision.people import Image, Person
 
 FloatArray = NDArray[np.float64]
 
@@ -40,16 +41,23 @@ _DIFFERENCE_M = 1e-3
 @dataclass(frozen=True, slots=True)
 class Standing:
     """One person on the floor. xy_m: (2,) map; covariance_m2: (2, 2), the camera taken as known exactly;
-    body: for the walk's smoother, None where no upright trunk is seen; by_feet: whether the feet are seen."""
+    body: for the walk's smoother, None where no upright trunk is seen; by_feet: whether the feet are seen;
+    clothes: their colours, None where not seen."""
 
     xy_m: FloatArray
     covariance_m2: FloatArray
     body: Body | None
     by_feet: bool
+    clothes: FloatArray | None = None
 
 
-def standing(person: Person, image_size: tuple[int, int], camera: Camera) -> Standing | Refusal:
-    """Where a person stands in a picture of `image_size`, (width, height) px, or why that cannot be told."""
+def standing(person: Person, image: Image, camera: Camera) -> Standing | Refusal:
+    """Where a person found in `image`, (height, width, 3) uint8 BGR, stands, or why that cannot be told."""
+    found = _place(person, (image.shape[1], image.shape[0]), camera)
+    return found if isinstance(found, Refusal) else replace(found, clothes=clothes(image, person))
+
+
+def _place(person: Person, image_size: tuple[int, int], camera: Camera) -> Standing | Refusal:
     cut = feet_cut(person, image_size)
     if cut is not None:
         return cut

@@ -10,9 +10,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from vad.vision.body import Body
+from vad.vision.clothes import MOST_UNLIKE, remembered, unlikeness
+from vad.vision.standing import Standing
 
 FloatArray = NDArray[np.float64]
 TimeArray = NDArray[np.int64]
@@ -63,19 +65,18 @@ class Track:
 class _Person:
     """One Kalman filter, state x, y, vx, vy, with what it has seen."""
 
-    def __init__(
-        self, track_id: int, t_ns: int, point: FloatArray, covariance: FloatArray, body: Body | None
-    ) -> None:
+    def __init__(self, track_id: int, t_ns: int, seen: Standing) -> None:
         self.id = track_id
         self.confirmed = False
         self.ended_ns: int | None = None
-        self.history: deque[tuple[int, FloatArray, FloatArray, Body | None]] = deque(maxlen=_HISTORY)
+        self.history: deque[tuple[int, Standing]] = deque(maxlen=_HISTORY)
         self._t_ns = t_ns
-        self._state = np.concatenate([point, [0.0, 0.0]])
+        self._state = np.concatenate([seen.xy_m, [0.0, 0.0]])
         self._p = np.zeros((4, 4))
-        self._p[:2, :2] = covariance
+        self._p[:2, :2] = seen.covariance_m2
         self._p[2:, 2:] = np.eye(2) * _BIRTH_SPEED_MPS**2
-        self.history.append((t_ns, point, covariance, body))
+        self.history.append((t_ns, seen))
+        self._clothes = seen.clothes
 
     @property
     def seen_ns(self) -> int:
@@ -89,31 +90,33 @@ class _Person:
         self._state = f @ self._state
         self._p = f @ self._p @ f.T + np.kron(_cv_noise(dt), np.eye(2))
 
-    def cost(self, point: FloatArray, covariance: FloatArray) -> float:
-        """Squared Mahalanobis distance of a point from where the person should be now."""
-        s = self._p[:2, :2] + covariance
-        error = point - self._state[:2]
-        return float(error @ np.linalg.solve(s, error))
+    def cost(self, seen: Standing) -> float:
+        """How ill what was seen fits this person: the squared Mahalanobis distance from where they should be
+        now, and how unlike the clothes are; infinite beyond the gate."""
+        error = seen.xy_m - self._state[:2]
+        apart = float(error @ np.linalg.solve(self._p[:2, :2] + seen.covariance_m2, error))
+        return apart + unlikeness(self._clothes, seen.clothes) if apart < _GATE else np.inf
 
-    def take(self, t_ns: int, point: FloatArray, covariance: FloatArray, body: Body | None) -> None:
-        s = self._p[:2, :2] + covariance
+    def take(self, t_ns: int, seen: Standing) -> None:
+        s = self._p[:2, :2] + seen.covariance_m2
         gain = np.linalg.solve(s, self._p[:2, :]).T
-        self._state = self._state + gain @ (point - self._state[:2])
+        self._state = self._state + gain @ (seen.xy_m - self._state[:2])
         left = np.eye(4)
         left[:, :2] -= gain
         self._p = left @ self._p
         self._p = 0.5 * (self._p + self._p.T)
-        self.history.append((t_ns, point, covariance, body))
+        self._clothes = remembered(self._clothes, seen.clothes)
+        self.history.append((t_ns, seen))
         self.confirmed |= len(self.history) >= HITS_TO_CONFIRM
 
     def track(self) -> Track:
-        times, points, covariances, bodies = zip(*self.history, strict=True)
+        times, seen = zip(*self.history, strict=True)
         return Track(
             self.id,
             np.array(times, dtype=np.int64),
-            np.array(points),
-            np.array(covariances),
-            tuple(bodies),
+            np.array([one.xy_m for one in seen]),
+            np.array([one.covariance_m2 for one in seen]),
+            tuple(one.body for one in seen),
             self.ended_ns is not None,
         )
 
@@ -127,41 +130,28 @@ class Tracker:
         self._next_id = 1
         self._t_ns = 0
 
-    def update(
-        self,
-        t_ns: int,
-        points_m: ArrayLike,
-        covariances_m2: ArrayLike,
-        bodies: Sequence[Body | None] | None = None,
-    ) -> None:
-        """Take one frame's ground points in the map: (N, 2) and (N, 2, 2); N may be 0; and their bodies.
+    def update(self, t_ns: int, people: Sequence[Standing]) -> None:
+        """Take one frame's people, none to six.
 
-        Points that are not finite are left out. Frames must come in order of time.
+        Places that are not finite are left out. Frames must come in order of time.
 
         Raises:
             ValueError: t_ns lies before the frame before.
         """
-        points = np.asarray(points_m, dtype=np.float64).reshape(-1, 2)
-        covariances = np.asarray(covariances_m2, dtype=np.float64).reshape(-1, 2, 2)
-        finite = np.asarray(np.isfinite(points).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2)))
-        given = bodies if bodies is not None else [None] * len(points)
-        bodies = [body for body, use in zip(given, finite.tolist(), strict=True) if use]
-        points, covariances = points[finite], covariances[finite]
+        seen = [one for one in people if np.isfinite(one.xy_m).all() and np.isfinite(one.covariance_m2).all()]
         if t_ns < self._t_ns:
             raise ValueError("frames must come in order of time")
         self._t_ns = t_ns
         self._bury(t_ns)  # first: after a pause in the frames nobody takes up a track that has ended
         for person in self._people:
             person.predict(t_ns)
-        costs = np.array(
-            [[p.cost(x, c) for x, c in zip(points, covariances, strict=True)] for p in self._people]
-        )
-        taken = _assign(costs.reshape(len(self._people), len(points)))
+        costs = np.array([[person.cost(one) for one in seen] for person in self._people])
+        taken = _assign(costs.reshape(len(self._people), len(seen)))
         for person, k in zip(self._people, taken, strict=True):
             if k is not None:
-                person.take(t_ns, points[k], covariances[k], bodies[k])
-        for k in set(range(len(points))) - set(taken):
-            self._people.append(_Person(self._next_id, t_ns, points[k], covariances[k], bodies[k]))
+                person.take(t_ns, seen[k])
+        for k in set(range(len(seen))) - set(taken):
+            self._people.append(_Person(self._next_id, t_ns, seen[k]))
             self._next_id += 1
 
     def _bury(self, t_ns: int) -> None:
@@ -188,7 +178,7 @@ def _cv_noise(dt: float) -> FloatArray:
 
 
 def _assign(costs: FloatArray) -> list[int | None]:
-    """For each row (track) its column (point) or None: least total cost, an empty hand costing the gate.
+    """For each row (track) its column (person seen) or None: least total cost, nobody costing most of all.
 
     Exact, by dynamic programming over the points' subsets: fine for the six people a frame can hold.
     """
@@ -197,9 +187,9 @@ def _assign(costs: FloatArray) -> list[int | None]:
     for row in range(tracks):
         grown: dict[int, tuple[float, list[int | None]]] = {}
         for used, (total, chosen) in best.items():
-            options: list[tuple[int, float, int | None]] = [(used, total + _GATE, None)]
+            options: list[tuple[int, float, int | None]] = [(used, total + _GATE + MOST_UNLIKE, None)]
             for k in range(points):
-                if not used >> k & 1 and costs[row, k] < _GATE:
+                if not used >> k & 1 and np.isfinite(costs[row, k]):
                     options.append((used | 1 << k, total + float(costs[row, k]), k))
             for mask, value, choice in options:
                 if mask not in grown or value < grown[mask][0]:
