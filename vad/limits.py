@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import msgspec
+
 from vad.errors import ProtocolError
 
 MAX_DEPTH = 32
 """Nesting of JSON; a parser that recurses gives up, or worse, somewhere beyond a thousand."""
+
+UNREADABLE = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
+"""What msgspec raises for bytes that are not what they should be: text that is no UTF-8 and nesting without
+an end come as errors that are not its own."""
 
 _OPEN, _CLOSE, _QUOTE, _BACKSLASH = b"[{", b"]}", ord('"'), ord("\\")
 

@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import io
+import math
+import struct
+import tokenize
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from vad.errors import ProtocolError
+
+MAX_SIDE = 8192
+"""Pixels of a picture that is read: a small file must not unpack into the whole memory."""
+MAX_HEADER_CHARACTERS = 1000
+"""Of a NumPy file, which numpy reads as Python."""
+_PNG = b"\x89PNG\r\n\x1a\n"
 
 FREE_GREY, UNKNOWN_GREY, OCCUPIED_GREY = 254, 205, 0
 
@@ -31,8 +40,7 @@ def grid_to_png(occupancy: NDArray[np.int8]) -> bytes:
 
 def png_to_grid(png: bytes) -> NDArray[np.int8]:
     """The (height, width) int8 grid that `grid_to_png` wrote, row 0 at the bottom; else ProtocolError."""
-    if not png:
-        raise ProtocolError("the map grid is empty")
+    _check_png(png)
     grey = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE)
     if grey is None:
         raise ProtocolError("the map grid is not a picture")
@@ -40,6 +48,22 @@ def png_to_grid(png: bytes) -> NDArray[np.int8]:
     grid[grey == FREE_GREY] = 0
     grid[grey == OCCUPIED_GREY] = 100
     return grid[::-1]
+
+
+def _check_png(png: bytes) -> None:
+    """ProtocolError for what OpenCV would take memory for that the file does not hold."""
+    if not png.startswith(_PNG):
+        raise ProtocolError("the map grid is no PNG")
+    at = len(_PNG)
+    while at < len(png):
+        length, kind = int.from_bytes(png[at : at + 4]), png[at + 4 : at + 8]
+        if at + 12 + length > len(png):
+            raise ProtocolError("the map grid is cut off")
+        if kind == b"IHDR":
+            sides = int.from_bytes(png[at + 8 : at + 12]), int.from_bytes(png[at + 12 : at + 16])
+            if max(sides) > MAX_SIDE:
+                raise ProtocolError(f"a map grid of {sides[0]} x {sides[1]} is larger than any home")
+        at += 12 + length
 
 
 def heatmap_to_png(probability: NDArray[np.float32]) -> bytes:
@@ -66,9 +90,15 @@ def heatmap_to_npy(probability: NDArray[np.float32]) -> bytes:
 
 def npy_to_heatmap(payload: bytes) -> NDArray[np.float32]:
     """The (height, width) float32 array that `heatmap_to_npy` wrote; else ProtocolError."""
+    file = io.BytesIO(payload)
     try:
-        found = np.load(io.BytesIO(payload), allow_pickle=False)
-    except (ValueError, EOFError) as error:
+        np.lib.format.read_magic(file)
+        shape, _, dtype = np.lib.format.read_array_header_1_0(file, max_header_size=MAX_HEADER_CHARACTERS)
+        if math.prod(shape) * dtype.itemsize > len(payload):
+            raise ValueError("it is cut off")
+        file.seek(0)
+        found = np.load(file, allow_pickle=False)
+    except (ValueError, EOFError, SyntaxError, tokenize.TokenError, struct.error, OverflowError) as error:
         raise ProtocolError(f"the heatmap is no array: {error}") from error
     if found.dtype != np.dtype("<f4") or found.ndim != 2:
         raise ProtocolError(f"the heatmap is {found.dtype} of {found.ndim} axes, not float32 of two")

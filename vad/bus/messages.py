@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -255,10 +255,42 @@ class EventsMessage(Message, frozen=True, kw_only=True):
     events: tuple[EventMessage, ...] = ()
 
 
+class DeviceWish(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a person wants of a device, as the payload of a query on `vad/<hub>/wishes`.
+
+    mac: any address the device ever had. ignore: leave it alone from now on, or no more. name: what to call it,
+    empty: what it calls itself. forget: drop it and all its walks. What is left out stays as it is; without
+    any, the answer only lists.
+    """
+
+    schema: Literal["vad.wish.v1"] = "vad.wish.v1"
+    mac: str | None = None
+    ignore: bool | None = None
+    name: Annotated[str, msgspec.Meta(max_length=64)] | None = None
+    forget: bool = False
+
+
+class IgnoredDevice(msgspec.Struct, frozen=True, kw_only=True):
+    """A device that is left alone. by_settings: the settings say so, and only they can say otherwise."""
+
+    mac: str
+    name: str | None = None
+    last_seen: str | None = None
+    by_settings: bool = False
+
+
+class WishReply(Message, frozen=True, kw_only=True):
+    """What became of a wish (empty where none was made), and who is ignored now."""
+
+    schema: Literal["vad.wishes.v1"] = "vad.wishes.v1"
+    text: str = ""
+    ignored: tuple[IgnoredDevice, ...] = ()
+
+
 class ErrorMessage(msgspec.Struct, frozen=True, kw_only=True):
     """Why a query is refused: a code for programs, a sentence for people.
 
-    Codes now: bad_selector; out_of_history (asked for a time before what is kept); not_available (this daemon
+    Codes now: bad_selector; bad_wish; out_of_history (asked for a time before what is kept); not_available (this daemon
     keeps no history); busy (ask again later); internal. A reader takes one it does not know for a refusal.
     """
 
@@ -278,6 +310,8 @@ ALL: tuple[type[msgspec.Struct], ...] = (
     StatusMessage,
     CaptureMessage,
     EventMessage,
+    DeviceWish,
+    WishReply,
     ErrorMessage,
 )
 """Every message type that has a schema of its own."""
@@ -305,7 +339,10 @@ def encode(message: msgspec.Struct) -> bytes:
 
 def decode(payload: bytes, kind: type[M]) -> M:
     """JSON bytes as a message; msgspec.DecodeError (ValidationError among them) for anything else."""
-    return msgspec.json.decode(payload, type=kind)
+    try:
+        return msgspec.json.decode(payload, type=kind)
+    except (UnicodeDecodeError, RecursionError) as error:  # as msgspec raises them; its own pass
+        raise msgspec.DecodeError(str(error)) from error
 
 
 def heatmap_message(

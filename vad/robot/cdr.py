@@ -39,7 +39,7 @@ class Transform(NamedTuple):
     def yaw_rad(self) -> float:
         """Counter-clockwise about the vertical."""
         return math.atan2(
-            2.0 * (self.qw * self.qz + self.qx * self.qy), 1.0 - 2.0 * (self.qy**2 + self.qz**2)
+            2.0 * (self.qw * self.qz + self.qx * self.qy), 1.0 - 2.0 * (self.qy * self.qy + self.qz * self.qz)
         )
 
 

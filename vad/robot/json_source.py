@@ -23,6 +23,7 @@ from typing import Literal
 import msgspec
 
 from vad.errors import ProtocolError
+from vad.limits import UNREADABLE, check_depth
 from vad.robot.pose import RobotPose
 
 NoPlace = Literal["not_localised", "lifted", "lost"]
@@ -63,9 +64,10 @@ _status_decoder = msgspec.json.Decoder(_Status)
 def report_from_json(payload: bytes, now_ns: int, epoch: int) -> RobotPose | NoPlace:
     """A pose as `pose_from_json` reads it, or why the robot has none; ProtocolError for anything else."""
     if len(payload) <= MAX_PAYLOAD_BYTES:
+        check_depth(payload)
         try:
             status = _status_decoder.decode(payload).status
-        except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        except UNREADABLE as error:
             raise ProtocolError(f"not a pose: {error}", remedy=_SCHEMA) from error
         if status != "localised" and status != "docked":
             return status
@@ -76,9 +78,10 @@ def pose_from_json(payload: bytes, now_ns: int, epoch: int) -> RobotPose:
     """The pose in one message that arrived at `now_ns` (timeline); ProtocolError for anything else."""
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise ProtocolError(f"a pose of more than {MAX_PAYLOAD_BYTES} bytes", remedy=_SCHEMA)
+    check_depth(payload)
     try:
         message = _decoder.decode(payload)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except UNREADABLE as error:
         raise ProtocolError(f"not a pose: {error}", remedy=_SCHEMA) from error
     _check(message, now_ns)
     return RobotPose(

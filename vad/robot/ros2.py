@@ -171,7 +171,8 @@ class Ros2Reader:
 
 
 def _check(pose: Transform) -> None:
-    norm2 = pose.qx**2 + pose.qy**2 + pose.qz**2 + pose.qw**2
+    # Products, for a power that is too large is an exception and a product is infinite.
+    norm2 = pose.qx * pose.qx + pose.qy * pose.qy + pose.qz * pose.qz + pose.qw * pose.qw
     if not (max(abs(pose.x), abs(pose.y)) <= MAX_COORDINATE_M and 0.9 < norm2 < 1.1):
         raise ProtocolError("a pose without finite numbers, outside any home, or without a unit quaternion")
 

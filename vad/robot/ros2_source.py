@@ -12,6 +12,7 @@ from typing import Literal
 import zenoh
 
 from vad.errors import ProtocolError
+from vad.handover import Intake
 from vad.health import Health
 from vad.robot.floor_plan import FloorPlan
 from vad.robot.pose import RobotPose, RobotStatus, status_now
@@ -25,6 +26,8 @@ RETRY_FIRST_S = 0.2
 RETRY_FACTOR = 2.0
 RETRY_MAX_S = 2.0
 _INBOX = 256
+_POSES = Intake(max_bytes=256 * 1024, per_s=2000.0, burst=1000, waiting=_INBOX)
+_MAPS = Intake(max_bytes=32 * 1024 * 1024, per_s=10.0, burst=10, waiting=4)
 
 PoseKind = Literal["tf", "pose", "pose_covariance", "odometry"]
 
@@ -108,7 +111,16 @@ class Ros2Source:
                 for style in self._topics.styles:
                     key = key_expression(topic, ROS_TYPES[kind], style=style, domain=self._topics.domain)
                     arrived = partial(_into, inbox, kind)
-                    stack.enter_context(subscribed(session, key, arrived, latched=kind in LATCHED))
+                    stack.enter_context(
+                        subscribed(
+                            session,
+                            key,
+                            arrived,
+                            intake=_MAPS if kind == "map" else _POSES,
+                            counters=self.health.counters,
+                            latched=kind in LATCHED,
+                        )
+                    )
             await self._read(inbox, out)
 
     async def _read(

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vad.errors import ProtocolError
+from vad.limits import UNREADABLE
 from vad.robot.floor_plan import FREE, OCCUPIED, UNKNOWN, FloorPlan, Room
 
 MAX_JSON_BYTES = 64_000_000
@@ -87,7 +88,7 @@ def map_from_payload(payload: bytes, epoch: int) -> ValetudoMap:
             if unpacker.unconsumed_tail or not unpacker.eof:
                 raise ProtocolError("the map is cut off, or too large")
         return _read(_decoder.decode(payload), epoch)
-    except (msgspec.DecodeError, UnicodeDecodeError, zlib.error, ValueError, OverflowError) as error:
+    except (*UNREADABLE, zlib.error, ValueError, OverflowError) as error:
         raise ProtocolError(
             f"this is no Valetudo map: {error}", remedy="Is this Valetudo 2021.04 or newer?"
         ) from error

@@ -9,12 +9,14 @@ import functools
 import logging
 import math
 import time
+from collections import Counter
 from collections.abc import AsyncGenerator
 from urllib.parse import SplitResult, unquote, urlsplit
 
 import zenoh
 
 from vad.errors import ConfigError, ProtocolError, SourceError
+from vad.handover import Intake
 from vad.health import Health
 from vad.robot.floor_plan import FloorPlan
 from vad.robot.pose import RobotPose, RobotStatus, status_now
@@ -36,6 +38,8 @@ RETRY_FIRST_S = 0.5
 RETRY_FACTOR = 2.0
 RETRY_MAX_S = 5.0
 _READ_BYTES = 65_536
+_INTAKE = Intake(max_bytes=8 * 1024 * 1024, per_s=20.0, burst=20, waiting=4)
+"""Of deflated maps, which are 10 to 100 KiB, every 2 s."""
 
 Payload = tuple[bytes, int]
 
@@ -82,7 +86,11 @@ class ValetudoSource:
         """Emit poses into `out` until cancelled; trouble goes into `health`, never out of here."""
         retry_s = RETRY_FIRST_S
         while True:
-            feed = _from_zenoh(self._session, self._key) if self._session else _from_sse(self._url)
+            feed = (
+                _from_zenoh(self._session, self._key, self.health.counters)
+                if self._session
+                else _from_sse(self._url)
+            )
             try:
                 async with contextlib.aclosing(feed) as payloads:
                     async for payload, arrival_ns in payloads:
@@ -135,9 +143,12 @@ class ValetudoSource:
         _log.log(level, "%s: %s", self.health.part, reason)
 
 
-async def _from_zenoh(session: zenoh.Session, key: str) -> AsyncGenerator[Payload, None]:
+async def _from_zenoh(
+    session: zenoh.Session, key: str, counters: Counter[str]
+) -> AsyncGenerator[Payload, None]:
     inbox: DropOldestQueue[Payload] = DropOldestQueue(4)
-    with subscribed(session, key, functools.partial(_into, inbox), latched=True):
+    arrived = functools.partial(_into, inbox)
+    with subscribed(session, key, arrived, intake=_INTAKE, counters=counters, latched=True):
         while True:
             try:
                 async with asyncio.timeout(ZENOH_SILENCE_S):

@@ -5,12 +5,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-import time
+from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator
 from typing import Any
 
 import zenoh
 import zenoh.ext
+
+from vad.handover import Handover, Intake
 
 RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}
 """When the session knocks again after the robot's router went away."""
@@ -67,14 +69,23 @@ async def _close(session: zenoh.Session) -> None:
 
 
 @contextlib.contextmanager
-def subscribed(session: zenoh.Session, key_expr: str, arrived: Arrived, *, latched: bool) -> Iterator[None]:
-    """Calls `arrived(payload, arrival_ns)` on the running loop; latched: asks for the last sample, too."""
-    loop = asyncio.get_running_loop()
+def subscribed(
+    session: zenoh.Session,
+    key_expr: str,
+    arrived: Arrived,
+    *,
+    intake: Intake,
+    counters: Counter[str],
+    latched: bool = False,
+) -> Iterator[None]:
+    """Calls `arrived(payload, arrival_ns)` on the running loop with what `intake` lets through.
+
+    counters: where the rest is counted (vad.handover). latched: asks for the last sample, too.
+    """
+    take = Handover(asyncio.get_running_loop(), arrived, intake, counters)
 
     def on_sample(sample: zenoh.Sample) -> None:
-        # zenoh's network thread: hand over and return; the loop may have closed in the meantime.
-        with contextlib.suppress(RuntimeError):
-            loop.call_soon_threadsafe(arrived, sample.payload.to_bytes(), time.monotonic_ns())
+        take(sample.payload)
 
     handler = zenoh.handlers.Callback(on_sample, None, indirect=False)
     subscriber: Any

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
-import time
 
 import zenoh
 
 from vad.errors import ProtocolError
+from vad.handover import Intake
 from vad.health import Health
-from vad.robot.json_source import NO_PLACE_REASONS, report_from_json
+from vad.robot.json_source import MAX_PAYLOAD_BYTES, NO_PLACE_REASONS, report_from_json
 from vad.robot.pose import RobotPose, RobotStatus, status_now
+from vad.robot.zenoh_link import subscribed
 from vad.streams import DropOldestQueue
 
 SILENCE_S = 2.0
 RETRY_S = 1.0
 _INBOX = 64
+_INTAKE = Intake(max_bytes=4 * MAX_PAYLOAD_BYTES, per_s=500.0, burst=250)
+"""Ten times what a robot sends; what is a little too long is still read, for the reason why not."""
 
 _log = logging.getLogger(__name__)
 
@@ -53,23 +55,15 @@ class ZenohPoseSource:
             await asyncio.sleep(RETRY_S)
 
     async def _subscribed(self, out: DropOldestQueue[RobotPose]) -> None:
-        loop = asyncio.get_running_loop()
         inbox: DropOldestQueue[tuple[bytes, int]] = DropOldestQueue(_INBOX)
 
-        def arrived(sample: zenoh.Sample) -> None:
-            # zenoh's network thread: hand over and return; the loop may have closed in the meantime.
-            with contextlib.suppress(RuntimeError):
-                loop.call_soon_threadsafe(inbox.put, (sample.payload.to_bytes(), time.monotonic_ns()))
+        def arrived(payload: bytes, arrival_ns: int) -> None:
+            inbox.put((payload, arrival_ns))
 
-        handler = zenoh.handlers.Callback(arrived, None, indirect=False)
-        # Not in a thread: a cancellation in between would leave a subscription nobody can undeclare.
-        subscriber = self._session.declare_subscriber(self._key_expr, handler)
-        try:
+        with subscribed(
+            self._session, self._key_expr, arrived, intake=_INTAKE, counters=self.health.counters
+        ):
             await self._receive(inbox, out)
-        finally:
-            # The session may be closed already.
-            with contextlib.suppress(zenoh.ZError):
-                subscriber.undeclare()  # type: ignore[no-untyped-call]
 
     async def _receive(
         self, inbox: DropOldestQueue[tuple[bytes, int]], out: DropOldestQueue[RobotPose]
