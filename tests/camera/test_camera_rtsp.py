@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import subprocess
 import threading
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -146,3 +148,40 @@ async def test_times_that_do_not_advance_give_way_to_the_arrival() -> None:
 def test_addresses_that_are_none(url: str) -> None:
     with pytest.raises(ConfigError):
         RtspCamera(url)
+
+
+def gstreamer(port: int) -> subprocess.Popen[str]:
+    """GStreamer's own RTSP server; the test is skipped where Debian's packages for it are missing."""
+    python, script = Path("/usr/bin/python3"), Path(__file__).parent / "gst_rtsp.py"
+    wanted = "import gi; gi.require_version('GstRtspServer', '1.0')"
+    if not python.exists() or subprocess.run([python, "-c", wanted], capture_output=True).returncode:
+        pytest.skip(
+            "no GStreamer: apt-get install gir1.2-gst-rtsp-server-1.0 gstreamer1.0-plugins-ugly python3-gi"
+        )
+    return subprocess.Popen(
+        [python, script, str(port)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("transport", ["tcp", "udp"])
+async def test_h264_of_gstreamers_server(transport: Transport) -> None:
+    with gstreamer(0) as server:
+        assert server.stdout is not None
+        port = int(server.stdout.readline())
+        camera = RtspCamera(f"rtsp://127.0.0.1:{port}/live", transport=transport)
+        async with running(camera) as out:
+            await until(lambda: len(out) >= 50, 40.0)
+            frames = out.drain()
+            assert camera.health.detail == "320x240, stamps: stream"
+            steps_ms = np.diff([f.t_ns for f in frames]) * 1e-6
+            assert np.median(steps_ms[10:]) == pytest.approx(40.0, abs=2.0)
+            assert frames[0].image.shape == (240, 320, 3)
+            server.terminate()
+            await until(lambda: camera.health.state == "degraded", 15.0)
+        with gstreamer(port) as again:
+            assert again.stdout is not None
+            assert int(again.stdout.readline()) == port
+            async with running(camera) as out:
+                await until(lambda: len(out) >= 10, 40.0)
+            again.terminate()

@@ -115,6 +115,20 @@ async def test_stamps_of_another_clock_are_replaced_by_the_arrival(stamp_ms: flo
     await asyncio.gather(task, return_exceptions=True)
 
 
+async def test_a_trusted_driver_is_believed_when_its_pictures_come_late() -> None:
+    late_ms = [30.0]
+    device = Device(lambda: monotonic_ms() - late_ms[0])
+    camera = V4l2Camera(V4l2Settings("/dev/video9"), opener=device.open)
+    out: DropOldestQueue[Frame] = DropOldestQueue(1000)
+    task = asyncio.create_task(camera.run(out))
+    await until(lambda: len(out) >= 2)
+    late_ms[0] = 5000.0
+    await until(lambda: time.monotonic_ns() - out.drain()[-1].t_ns > 4_000_000_000 if len(out) else False)
+    assert camera.health.counters["arrival_stamps"] == 0
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+
+
 async def test_absent_device_is_trouble_not_the_end(tmp_path: Path) -> None:
     camera = V4l2Camera(V4l2Settings(str(tmp_path / "video0")))
     task = asyncio.create_task(camera.run(DropOldestQueue(1)))

@@ -28,7 +28,7 @@ _TRANSFER_BYTES = 1 << 20
 _READ_TIMEOUT_MS = 500
 _COMMAND_TIMEOUT_MS = 1000
 _SILENT_READS = 8
-_END_S = 3.0
+_END_S = 6.0
 _READY_POLLS, _READY_POLL_S = 100, 0.1
 _STALE_READS, _STALE_TIMEOUT_MS = 16, 20
 # The decoder works on one picture, this many wait; older ones go.

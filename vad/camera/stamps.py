@@ -27,9 +27,9 @@ def parse_seconds_ns(text: str) -> int | None:
     return int(whole) * 1_000_000_000 + int(part[:9].ljust(9, "0"))
 
 
-def is_plausible(t_ns: int, arrival_ns: int) -> bool:
+def is_plausible(t_ns: int, arrival_ns: int, oldest_ns: int = _OLDEST_NS) -> bool:
     """Whether a picture that came at `arrival_ns` can have been taken at `t_ns`."""
-    return -_FUTURE_NS <= arrival_ns - t_ns <= _OLDEST_NS
+    return -_FUTURE_NS <= arrival_ns - t_ns <= oldest_ns
 
 
 class StreamClock:

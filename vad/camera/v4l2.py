@@ -23,6 +23,10 @@ from vad.streams import DropOldestQueue
 # The thread ends within one frame or this; OpenCV's own 10 s would hold up the end of the daemon.
 _SELECT_TIMEOUT_S = 1
 _SELECT_TIMEOUT_VARIABLE = "OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT"
+# Whether the driver's stamps are on the timeline shows in the first picture; on a busy machine later ones may
+# wait in the driver's buffers for longer, and their stamps are right all the same.
+_OLDEST_FIRST_NS = 2_000_000_000
+_OLDEST_TRUSTED_NS = 30_000_000_000
 
 
 class Capture(Protocol):
@@ -89,14 +93,15 @@ class V4l2Camera:
             capture.set(cv2.CAP_PROP_FRAME_WIDTH, wanted.width_px)
             capture.set(cv2.CAP_PROP_FRAME_HEIGHT, wanted.height_px)
             capture.set(cv2.CAP_PROP_FPS, wanted.fps)
-            fourcc = _format(capture)
+            fourcc, oldest_ns = _format(capture), _OLDEST_FIRST_NS
             while not stop.is_set():
                 good, image = capture.read()
                 arrival_ns = time.monotonic_ns()
                 if not good or image is None:
                     raise SourceError("the camera has stopped sending", where=wanted.device)
                 driver_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
-                trusted = driver_ns > 0 and is_plausible(driver_ns, arrival_ns)
+                trusted = driver_ns > 0 and is_plausible(driver_ns, arrival_ns, oldest_ns)
+                oldest_ns = _OLDEST_TRUSTED_NS if trusted else _OLDEST_FIRST_NS
                 t_ns = min(driver_ns, arrival_ns) if trusted else arrival_ns
                 picture = np.asarray(image, dtype=np.uint8)
                 height, width = picture.shape[:2]
