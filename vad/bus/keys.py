@@ -75,6 +75,11 @@ class HubKeys:
         """All devices in one DevicesMessage (or GeoJSON FeatureCollection), on request only."""
         return self._key("devices")
 
+    @property
+    def wishes(self) -> str:
+        """Asked with a DeviceWish, answered with a WishReply: what people want of the devices."""
+        return self._key("wishes")
+
     def camera(self, camera: str = ANY) -> str:
         """CameraMessage of one camera, or the pattern of all."""
         return self._key("cameras", ANY if camera == ANY else chunk(camera))
@@ -131,6 +136,7 @@ _FIXED = {
     ("map", "grid"): "grid",
     ("events",): "events",
     ("devices",): "devices",
+    ("wishes",): "wishes",
 }
 _NAMED = {"cameras": "camera", "devices": "device", "capture": "capture", "schema": "schema"}
 _OF_DEVICES = ("heatmap", "history")

@@ -24,6 +24,9 @@ CaptureState = Literal["idle", "armed", "recording", "stopping", "solving", "don
 PartState = Literal["starting", "ok", "degraded", "failed"]
 EventKind = Literal["joined", "mapped", "moved", "lost"]
 
+MAX_CELLS_A_SIDE = 8192
+"""Of a heatmap that is read; a small message must not unpack into the whole memory."""
+
 Point = tuple[float, float]
 Vector3 = tuple[float, float, float]
 Matrix2 = tuple[Point, Point]
@@ -258,9 +261,9 @@ class EventsMessage(Message, frozen=True, kw_only=True):
 class DeviceWish(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What a person wants of a device, as the payload of a query on `vad/<hub>/wishes`.
 
-    mac: any address the device ever had. ignore: leave it alone from now on, or no more. name: what to call it,
-    empty: what it calls itself. forget: drop it and all its walks. What is left out stays as it is; without
-    any, the answer only lists.
+    mac: any address the device ever had. ignore: leave it alone from now on, or no more. name: what to call
+    it, empty: what it calls itself. forget: drop it and all its walks. What is left out stays as it is;
+    without any, the answer only lists.
     """
 
     schema: Literal["vad.wish.v1"] = "vad.wish.v1"
@@ -290,8 +293,9 @@ class WishReply(Message, frozen=True, kw_only=True):
 class ErrorMessage(msgspec.Struct, frozen=True, kw_only=True):
     """Why a query is refused: a code for programs, a sentence for people.
 
-    Codes now: bad_selector; bad_wish; out_of_history (asked for a time before what is kept); not_available (this daemon
-    keeps no history); busy (ask again later); internal. A reader takes one it does not know for a refusal.
+    Codes now: bad_selector; bad_wish; out_of_history (asked for a time before what is kept); not_available
+    (this daemon keeps no history); busy (ask again later); internal. A reader takes one it does not know for
+    a refusal.
     """
 
     schema: Literal["vad.error.v1"] = "vad.error.v1"
@@ -371,12 +375,14 @@ def heatmap_message(
 
 def probabilities(heatmap: HeatmapMessage) -> NDArray[np.float32]:
     """The posterior as (height, width) float32, row 0 at y0; ProtocolError where the sizes disagree."""
+    if not (1 <= heatmap.width <= MAX_CELLS_A_SIDE and 1 <= heatmap.height <= MAX_CELLS_A_SIDE):
+        raise ProtocolError("the heatmap's size is not that of a home", where=heatmap.mac)
     cells = heatmap.width * heatmap.height
     try:
         # bounded: a small message must not unpack into the whole memory
-        raw = zlib.decompressobj().decompress(heatmap.probability, 4 * max(cells, 0) + 1)
+        raw = zlib.decompressobj().decompress(heatmap.probability, 4 * cells + 1)
     except zlib.error as error:
         raise ProtocolError(f"the heatmap is damaged: {error}", where=heatmap.mac) from error
-    if heatmap.width < 1 or heatmap.height < 1 or len(raw) != 4 * cells:
+    if len(raw) != 4 * cells:
         raise ProtocolError("the heatmap's size is not the one it states", where=heatmap.mac)
     return np.frombuffer(raw, "<f4").astype(np.float32).reshape(heatmap.height, heatmap.width)

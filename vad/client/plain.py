@@ -175,6 +175,18 @@ class VadClient:
         """JSON Schemas of everything the daemon sends, by schema id."""
         return self._ask(self._questions.schemas())
 
+    def wish(self, wish: m.DeviceWish) -> m.WishReply:
+        """Have the daemon ignore, rename or forget a device; what became of it, and who is ignored now.
+
+        Raises QueryError where the daemon refuses, VadError where it is not clear which hub is meant.
+        """
+        hubs = self.hubs()
+        if len(hubs) > 1:
+            raise VadError(f"several hubs answer: {', '.join(hubs)}", remedy="Name one with --hub")
+        if not hubs:
+            raise self._unreachable()
+        return self._ask(q.Questions(HubKeys(hubs[0])).wish(wish))
+
     def events(self, timeout_s: float | None = None) -> Iterator[m.EventMessage]:
         """What happens from now on, until `timeout_s` passes without an event (None: for ever).
 
@@ -250,6 +262,7 @@ class VadClient:
         try:
             replies = self._connected().get(
                 question.selector,
+                payload=question.payload,
                 target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 timeout=self._timeout_s,

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
@@ -43,10 +45,11 @@ class QueryError(VadError):
 
 @dataclass(frozen=True, slots=True)
 class Question(Generic[T]):
-    """selector: key and parameters; read: the payloads that came -> the answer."""
+    """selector: key and parameters; read: the payloads that came -> the answer; payload: goes with it."""
 
     selector: str
     read: Callable[[Payloads], T]
+    payload: bytes | None = None
 
 
 class Questions:
@@ -68,7 +71,8 @@ class Questions:
         """Devices by MAC."""
 
         def read(found: Payloads) -> list[m.DeviceMessage]:
-            answers = (decoded(payload, m.DevicesMessage, key) for key, payload in found.items())
+            with _uncollected():
+                answers = [decoded(payload, m.DevicesMessage, key) for key, payload in found.items()]
             together = [device for answer in answers for device in answer.devices]
             return sorted(together, key=lambda device: (device.mac, device.hub))
 
@@ -88,7 +92,9 @@ class Questions:
         """The same as a GeoJSON FeatureCollection."""
 
         def read(found: Payloads) -> dict[str, Any]:
-            features = [one for key, payload in found.items() for one in _object(payload, key)["features"]]
+            with _uncollected():
+                answers = [_object(payload, key) for key, payload in found.items()]
+            features = [feature for answer in answers for feature in answer["features"]]
             return {"type": "FeatureCollection", "features": features}
 
         question = _device_question(room, state, mac, max_sigma_m, since, bbox, at, form="geojson")
@@ -136,6 +142,20 @@ class Questions:
         """The last capture sessions."""
         return self._several(self._keys.capture(), m.CaptureMessage, lambda one: (one.published_at, one.hub))
 
+    def wish(self, wish: m.DeviceWish) -> Question[m.WishReply]:
+        """What a person wants of a device."""
+        key = self._keys.wishes
+
+        def read(found: Payloads) -> m.WishReply:
+            payload = _single(found, key)
+            if payload is None:
+                raise ProtocolError(
+                    "this daemon takes no wishes", where=key, remedy="Bring vad up to date there"
+                )
+            return decoded(payload, m.WishReply, key)
+
+        return Question(key, read, m.encode(wish))
+
     def map(self) -> Question[m.MapMessage | None]:
         """The floor plan's frame."""
         return self._one(self._keys.map, m.MapMessage)
@@ -182,6 +202,18 @@ class Questions:
 
     def _bytes(self, selector: str) -> Question[bytes | None]:
         return Question(selector, lambda found: _single(found, selector))
+
+
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """No garbage collection amid the reading of thousands of small values: it finds none and takes longest."""
+    wanted = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if wanted:
+            gc.enable()
 
 
 def decoded(payload: bytes, kind: type[M], where: str) -> M:

@@ -10,6 +10,7 @@ from vad.commands.agent import agent
 from vad.commands.camera import app as camera_app
 from vad.commands.csi import csi_app
 from vad.commands.demo import demo
+from vad.commands.device import device_app
 from vad.commands.devices import devices
 from vad.commands.doctor import doctor
 from vad.commands.map import map_app
@@ -49,6 +50,7 @@ app.command()(run)
 app.command("check-config")(check_config)
 app.command()(agent)
 app.command()(devices)
+app.add_typer(device_app, name="device")
 app.add_typer(map_app, name="map")
 app.command()(status)
 app.command()(replay)

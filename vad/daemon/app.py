@@ -42,6 +42,7 @@ from vad.daemon.notify import notify
 from vad.daemon.parts import Parts
 from vad.daemon.past import StoredPast
 from vad.daemon.registry import Registry
+from vad.daemon.wishes import Wishes
 from vad.devices.station import StationEvent
 from vad.errors import VadError
 from vad.health import Health
@@ -175,6 +176,8 @@ class Daemon:
         group.create_task(ears.run(batches), name="ears")
         group.create_task(agents.run(self._bus.session), name="agents")
         group.create_task(_register(stations, registry, captures.joined), name="stations")
+        wishes = Wishes(self._bus.keys, registry, settings.source)
+        group.create_task(wishes.run(self._bus.session), name="wishes")
         group.create_task(captures.run(), name="captures")
         group.create_task(self._keep_calibrations(), name="calibrations")
         follow = partial(self._use_plan, robot, eyes, registry, captures)

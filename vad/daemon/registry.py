@@ -64,9 +64,9 @@ class Registry:
             elif device.mac != record.mac:
                 await self._store.forget_device(record.mac)  # cut off while two became one
                 continue
-            if self._ignores(record.mac):
+            if self.roster.ignores(record.mac):
                 continue
-            known = replace(record, name=self._name(record.mac))
+            known = replace(record, name=self.roster.name(record.mac))
             if stale := self._stale(record):
                 known = replace(record, state="stale", reason=stale)
             elif record.state == "capturing":
@@ -112,7 +112,7 @@ class Registry:
             changed.pop(mac, None)
             if change.kind == "gone":
                 self._drop(mac)
-            elif not self._ignores(mac):
+            elif not self.roster.ignores(mac):
                 changed[mac] = change.device
         fresh = [mac for mac in changed if mac not in self._devices]
         await self._describe(changed.values())
@@ -145,7 +145,7 @@ class Registry:
                 self._event("joined", record.mac, f"{record.name or record.mac} joined the network")
 
     def _described(self, device: Device) -> DeviceRecord:
-        mac, name = device.mac, self._name(device.mac)
+        mac, name = device.mac, self.roster.name(device.mac)
         known = self._devices.get(mac)
         if known is None:
             now = now_rfc3339()
@@ -155,9 +155,12 @@ class Registry:
         return known if known.name == name else replace(known, name=name)
 
     async def ignore(self, mac: str, *, on: bool) -> None:
-        """Leave a known device alone, or no more; VadError where there is none."""
-        device = await self.roster.change(self._device(mac).mac, ignored=on)
-        if self._ignores(device.mac):
+        """Leave a known device alone, or no more; VadError where that cannot be."""
+        device = self.roster.known(mac)
+        if not on and self.roster.table.in_settings(device):
+            raise VadError(f"the settings ignore {mac}", remedy="Take it out of devices.ignore there")
+        device = await self.roster.change(device.mac, ignored=on)
+        if self.roster.ignores(device.mac):
             self._devices.pop(device.mac, None)
             self._bus.forget_device(device.mac)
         elif device.mac not in self._devices:
@@ -167,8 +170,8 @@ class Registry:
             await self._describe([device])
 
     async def rename(self, mac: str, name: str) -> None:
-        """Give a known device a name, an empty one takes it away; VadError where there is no such device."""
-        device = self._device(mac)
+        """Give a known device a name, an empty one takes it away; VadError where that cannot be."""
+        device = self.roster.known(mac)
         if listed := self.roster.table.listed_name(device):
             raise VadError(f"{mac} is called {listed!r} in the settings", remedy="Change it there")
         device = await self.roster.change(device.mac, name=name)
@@ -177,26 +180,13 @@ class Registry:
 
     async def forget(self, mac: str) -> None:
         """Drop a known device and all its walks; when it joins again it is new."""
-        device = await self.roster.forget(self._device(mac).mac)
+        device = await self.roster.forget(self.roster.known(mac).mac)
         self._drop(device.mac)
 
     def _drop(self, mac: str) -> None:
         self._devices.pop(mac, None)
         self._left_ns.pop(mac, None)
         self._bus.forget_device(mac)
-
-    def _device(self, mac: str) -> Device:
-        device = self.roster.table.find(normal_mac(mac))
-        if device is None:
-            raise VadError(f"no device with the address {mac} is known", remedy="`vad devices` lists them")
-        return device
-
-    def _ignores(self, mac: str) -> bool:
-        device = self.roster.table.find(mac)
-        return device is not None and self.roster.table.ignores(device)
-
-    def _name(self, mac: str) -> str | None:
-        return self.roster.table.name_of(device) if (device := self.roster.table.find(mac)) else None
 
     async def use_plan(self, plan: FloorPlan, transform: PlanTransform | None, reason: str) -> None:
         """Go on with another floor plan.

@@ -13,6 +13,7 @@ from vad.devices.device import Change, Device
 from vad.devices.oui import PLACES, Makers, load_makers
 from vad.devices.station import StationEvent
 from vad.devices.table import DeviceTable
+from vad.errors import VadError
 from vad.health import Health
 from vad.mac import normal_mac
 from vad.store.worker import StoreWorker
@@ -95,6 +96,22 @@ class Roster:
         device = self.table.forget(mac)
         await self._store.save_identities([], [device.mac])
         return device
+
+    def known(self, mac: str) -> Device:
+        """The device that has or had this address, an ignored one too; VadError where there is none."""
+        device = self.table.find(normal_mac(mac))
+        if device is None:
+            raise VadError(f"no device with the address {mac} is known", remedy="`vad devices` lists them")
+        return device
+
+    def ignores(self, mac: str) -> bool:
+        """Whether the device is to be left alone."""
+        device = self.table.find(mac)
+        return device is not None and self.table.ignores(device)
+
+    def name(self, mac: str) -> str | None:
+        """What the device is called."""
+        return self.table.name_of(device) if (device := self.table.find(mac)) else None
 
     async def _keep(self, changes: Sequence[Change]) -> None:
         if not changes:

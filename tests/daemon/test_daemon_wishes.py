@@ -1,0 +1,126 @@
+"""`vad device`: what people want of a device, through a real bus to the registry and its store."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+from daemon_world import free_port, settings_for
+from typer.testing import CliRunner
+
+from vad.bus import messages as m
+from vad.bus.node import Bus
+from vad.bus.session import BusSettings
+from vad.client import QueryError, VadClient
+from vad.commands.device import device_app
+from vad.daemon.registry import Registry
+from vad.daemon.wishes import MAX_BYTES, Wishes
+from vad.sim.home import floor_plan
+from vad.sim.scenario import make_home
+from vad.store.worker import StoreWorker
+
+LAMP, TV, PHONE = (f"f4:f5:d8:00:00:0{k}" for k in (1, 2, 3))
+PLAN = floor_plan(make_home(1))
+
+
+class Home:
+    """A hub with a lamp and a TV; the settings name the TV and ignore the phone."""
+
+    def __init__(self, endpoint: str) -> None:
+        self._endpoint = endpoint
+
+    async def vad_device(self, *arguments: str, code: int = 0) -> str:
+        """What the command says."""
+        command = [*arguments, "--endpoint", self._endpoint]
+        result = await asyncio.to_thread(CliRunner().invoke, device_app, command)
+        assert result.exit_code == code, (result.output, result.exception)
+        return " ".join((result.stdout + result.stderr).split())
+
+    async def devices(self) -> dict[str, str | None]:
+        """MAC -> name of all that are published."""
+
+        def ask() -> list[m.DeviceMessage]:
+            with VadClient(self._endpoint) as client:
+                return client.devices()
+
+        return {device.mac: device.name for device in await asyncio.to_thread(ask)}
+
+    async def wish_raw(self, payload: bytes) -> str:
+        """What the daemon says to any bytes as a wish."""
+
+        def ask() -> str:
+            with VadClient(self._endpoint) as client:
+                question = client._questions.wish(m.DeviceWish())
+                with pytest.raises(QueryError) as caught:
+                    client._ask(type(question)("vad/home/wishes", question.read, payload))
+                assert caught.value.code == "bad_wish"
+                return str(caught.value)
+
+        return await asyncio.to_thread(ask)
+
+
+@asynccontextmanager
+async def home(folder: Path) -> AsyncIterator[Home]:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    devices = {"ignore": [PHONE], "static": [{"mac": TV, "name": "the big one"}]}
+    settings = settings_for(folder, devices=devices)
+    async with StoreWorker(folder / "vad.sqlite") as store, Bus(BusSettings(listen=(endpoint,))) as bus:
+        registry = Registry(settings, PLAN, bus, store)
+        await registry.load()
+        for mac, name in ((LAMP, "ESP_1234"), (TV, None), (PHONE, "phone")):
+            await registry.joined(mac, name)
+        wishes = asyncio.create_task(Wishes(bus.keys, registry, "simulated").run(bus.session))
+        try:
+            yield Home(endpoint)
+        finally:
+            wishes.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await wishes
+
+
+async def test_a_device_is_ignored_and_shown_again(tmp_path: Path) -> None:
+    async with home(tmp_path) as there:
+        assert await there.vad_device("ignore", LAMP.upper()) == f"{LAMP} is left alone from now on"
+        assert await there.devices() == {TV: "the big one"}
+        said = await there.vad_device("ignored")
+        assert f"{LAMP} ESP_1234" in said
+        assert said.endswith("vad device ignore") or f"{PHONE} phone" in said
+    async with home(tmp_path) as there:
+        listed = json.loads(await there.vad_device("ignored", "--json"))
+        assert {(one["mac"], one["by_settings"]) for one in listed} == {(LAMP, False), (PHONE, True)}
+        assert await there.vad_device("show", LAMP) == f"{LAMP} is a device again"
+        assert await there.devices() == {LAMP: "ESP_1234", TV: "the big one"}
+        assert "the settings ignore" in await there.vad_device("show", PHONE, code=2)
+
+
+async def test_a_device_is_renamed_and_forgotten(tmp_path: Path) -> None:
+    async with home(tmp_path) as there:
+        assert await there.vad_device("rename", LAMP, " lamp ") == f"{LAMP} is called 'lamp'"
+        assert (await there.devices())[LAMP] == "lamp"
+        assert await there.vad_device("rename", LAMP, "") == f"{LAMP} has no given name"
+        assert (await there.devices())[LAMP] == "ESP_1234"
+        assert "in the settings" in await there.vad_device("rename", TV, "small", code=2)
+        assert "forgotten" in await there.vad_device("forget", LAMP)
+        assert await there.devices() == {TV: "the big one"}
+        assert "no device with the address" in await there.vad_device("forget", LAMP, code=2)
+        assert "not a MAC address" in await there.vad_device("forget", "lamp", code=2)
+
+
+async def test_what_is_no_wish_is_refused(tmp_path: Path) -> None:
+    async with home(tmp_path) as there:
+        for payload in (b"", b"\xff", b"[]", b'{"mac": 1}', b'{"schema": "vad.wish.v9"}', b'{"wish": 1}'):
+            assert "Not a wish" in await there.wish_raw(payload)
+        assert "too long" in await there.wish_raw(b" " * (MAX_BYTES + 1))
+        assert "needs the address" in await there.wish_raw(b'{"ignore": true}')
+        assert "printed" in await there.wish_raw(json.dumps({"mac": LAMP, "name": "a\x1b[2J"}).encode())
+        assert await there.devices() == {LAMP: "ESP_1234", TV: "the big one"}
+
+
+async def test_no_daemon_answers() -> None:
+    there = Home(f"tcp/127.0.0.1:{free_port()}")
+    assert "vad run" in await there.vad_device("ignore", LAMP, code=3)
