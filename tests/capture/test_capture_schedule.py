@@ -180,6 +180,13 @@ def test_a_mapped_device_is_looked_at_once_a_day() -> None:
     assert never.decide(1000 * H, [mapped], WALKER).provoke == ()
 
 
+def test_a_restart_every_night_does_not_put_the_check_off_for_ever() -> None:
+    mapped = device(LAMP, "mapped", heard=0.0, reaches=True, walks=2, measured_ago_ns=23 * H)
+    book = Schedule(Limits(recheck_ns=24 * H))
+    assert book.decide(0, [mapped], WALKER).provoke == ()
+    assert book.decide(H, [mapped], WALKER).provoke == (LAMP,)
+
+
 def test_without_airtime_only_those_are_measured_that_send_by_themselves() -> None:
     quiet, busy = device(LAMP, heard=0.0, reaches=True), device(TV, walks=3)
     decision = Schedule().decide(S, [quiet, busy], WALKER, airtime=False)

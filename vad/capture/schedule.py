@@ -52,7 +52,8 @@ class Candidate:
 
     state: of its record; walks: in its map; doubted: its last walk contradicts its map; heard_per_s: CSI
     packets now; reaches: it can be made to send; why_unheard: the reason where it gives no CSI; wish: what
-    another walk would be good for.
+    another walk would be good for; measured_ago_ns: how long its last walk is past, as an earlier run knew
+    it; that counts when the device is first met.
     """
 
     mac: str
@@ -64,6 +65,7 @@ class Candidate:
     reaches: bool = False
     why_unheard: str = ""
     wish: str = NOBODY
+    measured_ago_ns: int = 0
 
     @property
     def heard(self) -> bool:
@@ -276,7 +278,7 @@ class Schedule:
         known = {device.mac for device in devices}
         self._books = {mac: book for mac, book in self._books.items() if mac in known}
         for device in devices:
-            self._book(now_ns, device.mac)
+            self._book(now_ns - device.measured_ago_ns, device.mac)
 
     def _book(self, now_ns: int, mac: str) -> _Book:
         return self._books.setdefault(mac, _Book(now_ns))

@@ -24,6 +24,7 @@ from vad.daemon.findings import DeviceGoneError, Finding, Findings
 from vad.daemon.registry import Registry
 from vad.daemon.solver_child import SolvedWalk
 from vad.store.records import DeviceRecord
+from vad.wall import now_rfc3339, seconds_between
 
 _WAITING = ("discovered", "waiting", "stale", "capturing")
 """States in which a device says what it waits for; a mapped or a failed one keeps what it says."""
@@ -132,7 +133,15 @@ class Measuring:
             hearing.reaches,
             hearing.why,
             self._registry.wish(record.mac),
+            _ago_ns(record),
         )
+
+
+def _ago_ns(record: DeviceRecord) -> int:
+    """How long the last walk is past; a wall clock that was set meanwhile tells nothing worse than `now`."""
+    if not record.walks:
+        return 0
+    return max(0, int(seconds_between(record.updated_at, now_rfc3339()) * 1e9))
 
 
 def useless(walk: SolvedWalk, epoch: int) -> tuple[str, bool]:
