@@ -61,7 +61,7 @@ def new_authority(hub: str, now: datetime) -> Authority:
     key = _new_key()
     name = _name(f"vad authority of {hub}")
     certificate = (
-        _builder(name, name, key.public_key(), now, now + timedelta(days=AUTHORITY_DAYS))
+        _builder(name, name, key.public_key(), key, now, now + timedelta(days=AUTHORITY_DAYS))
         .add_extension(x509.BasicConstraints(ca=True, path_length=1), critical=True)
         .add_extension(_may_sign(), critical=True)
         .sign(key, hashes.SHA256())
@@ -81,6 +81,7 @@ def new_hub_certificate(authority: Authority, hub: str, addresses: Iterable[str]
             _name(f"vad hub {hub}"),
             issuer.subject,
             key.public_key(),
+            issuer_key,
             now,
             _until(issuer, now + timedelta(days=HUB_DAYS)),
         )
@@ -100,7 +101,9 @@ def new_client(authority: Authority, role: Role, name: str, days: float, now: da
     usage = _only_for(ExtendedKeyUsageOID.CLIENT_AUTH)
     link_key = _new_key()
     link = (
-        _builder(_name(f"link of {common_name}"), issuer.subject, link_key.public_key(), now, not_after)
+        _builder(
+            _name(f"link of {common_name}"), issuer.subject, link_key.public_key(), issuer_key, now, not_after
+        )
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(_may_sign(), critical=True)
         .add_extension(usage, critical=False)
@@ -108,7 +111,7 @@ def new_client(authority: Authority, role: Role, name: str, days: float, now: da
     )
     key = _new_key()
     certificate = (
-        _builder(_name(common_name), link.subject, key.public_key(), now, not_after)
+        _builder(_name(common_name), link.subject, key.public_key(), link_key, now, not_after)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(usage, critical=False)
         .sign(link_key, hashes.SHA256())
@@ -176,6 +179,7 @@ def _builder(
     subject: x509.Name,
     issuer: x509.Name,
     public_key: ec.EllipticCurvePublicKey,
+    signer: ec.EllipticCurvePrivateKey,
     now: datetime,
     not_after: datetime,
 ) -> x509.CertificateBuilder:
@@ -188,6 +192,9 @@ def _builder(
         .not_valid_before(min(now, not_after) - BACKDATED)
         .not_valid_after(not_after)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(public_key), critical=False)
+        .add_extension(
+            x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key()), critical=False
+        )
     )
 
 

@@ -20,6 +20,7 @@ from pathlib import Path
 import msgspec
 
 from vad.errors import VadError
+from vad.limits import UNREADABLE
 from vad.pki.certificates import (
     Authority,
     Issued,
@@ -99,7 +100,7 @@ class PkiFolder:
             ) from error
         try:
             return msgspec.json.decode(content, type=Register)
-        except msgspec.DecodeError as error:
+        except UNREADABLE as error:
             raise VadError(
                 f"the list of certificates is damaged ({error})",
                 where=str(self.register_file),
