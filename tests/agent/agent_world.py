@@ -101,11 +101,18 @@ async def there(agents: Agents, mac: str = MAC) -> RemoteCard:
 
 @contextlib.asynccontextmanager
 async def running_node(
-    port: int, fifo: Path, *, name: str = "attic", mac: str = MAC, buffer_bytes: int = 32_000_000
+    hub: int | str,
+    fifo: Path,
+    *,
+    name: str = "attic",
+    mac: str = MAC,
+    buffer_bytes: int = 32_000_000,
+    credentials: Path | None = None,
 ) -> AsyncIterator[Node]:
-    """An agent in this process."""
+    """An agent in this process. hub: a port of the loopback interface, or an endpoint."""
+    endpoint = hub if isinstance(hub, str) else f"tcp/127.0.0.1:{hub}"
     node = Node(
-        BusSettings(hub=HUB, mode="client", listen=(), connect=(f"tcp/127.0.0.1:{port}",)),
+        BusSettings(hub=HUB, mode="client", listen=(), connect=(endpoint,), credentials=credentials),
         AgentInfo(id=name, mac=mac),
         FollowLog(fifo),
         batch_s=0.03,
