@@ -71,6 +71,8 @@ def simulate(
     known_lens: bool = False,
     laps: int = 1,
     spurious: int = 0,
+    latency_s: float = 0.2,
+    jump_m: float = 0.0,
 ) -> Scene:
     """A drive seen by a camera of unknown focal length; a person's blobs for a third of the time."""
     rng = np.random.default_rng(seed)
@@ -80,10 +82,11 @@ def simulate(
     camera_from_map = look_at(eye, [rng.uniform(1.1, 1.6), rng.uniform(1.1, 1.6), 0.0])
     truth = drive(np.vstack([way_points(shape, rng) for _ in range(laps)]))
     mapper = CameraMapper(640, 480, lens if known_lens else None)
-    latency_s = 0.2
     duration = len(truth) * 0.01
     for t in np.arange(0.0, duration, 1.0 / pose_hz):
         x, y = truth[min(round(t * 100), len(truth) - 1)] + rng.normal(0.0, 0.02, 2)
+        # In the first third the robot believes to be elsewhere.
+        x += jump_m if t < duration / 3.0 else 0.0
         mapper.add_pose(int((t + latency_s) * S_NS), float(x), float(y), 0.02)
     walker = rng.uniform(0, 640, 2)
     previous = truth[0]
@@ -187,6 +190,21 @@ def test_floor_point_covariance_covers_its_error() -> None:
     assert np.all(np.isnan(sky))
 
 
+def test_homography_covariance_is_that_of_its_floor_points() -> None:
+    scene = simulate("rectangle", 2, known_lens=True, k1=0.0)
+    result = scene.mapper.solve()
+    px = np.array([[250.0, 300.0]])
+    x, y, w = np.append(px[0], 1.0) @ result.map_from_image.T
+    row = np.append(px[0], 1.0)
+    zero = np.zeros(3)
+    by_entry = np.array(
+        [np.concatenate([row, zero, -x / w * row]) / w, np.concatenate([zero, row, -y / w * row]) / w]
+    )
+    _, covariance = result.floor_point(px, 0.0)
+    assert np.allclose(by_entry @ result.homography_covariance @ by_entry.T, covariance[0], rtol=1e-3)
+    assert CameraCalibration("collecting", 0, "").homography_covariance is None
+
+
 def test_calibration_survives_json() -> None:
     result = simulate("L", 0).mapper.solve()
     back = CameraCalibration.from_dict(json.loads(json.dumps(result.to_dict())))
@@ -265,6 +283,7 @@ def test_a_robot_seen_on_one_spot_is_collecting_and_told_where_to_go() -> None:
     assert "m2" in result.reason
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", ["rectangle", "L", "random"])
 @pytest.mark.parametrize("walks", [True, False])
 def test_motion_that_is_not_the_robot_is_never_valid(shape: str, walks: bool) -> None:
@@ -284,6 +303,47 @@ def test_motion_that_is_not_the_robot_is_never_valid(shape: str, walks: bool) ->
         assert result.reason
         invalid += result.status == "invalid"
     assert invalid >= 2
+
+
+@pytest.mark.parametrize("jump_m", [0.2, 0.5, 3.0])
+def test_wild_poses_are_dropped_and_jumps_begin_a_segment(jump_m: float) -> None:
+    rng = np.random.default_rng(5)
+    t = np.arange(0.0, 60.0, 0.1)
+    xy = np.column_stack([0.2 * t, np.sin(0.2 * t)]) + rng.normal(0.0, 0.015, (len(t), 2))
+    wild = rng.choice(np.arange(20, len(t) - 20), 25, replace=False)
+    xy[wild] += rng.uniform(0.5, 2.0, (25, 2))
+    track = PoseTrack(t, xy, np.full(len(t), 0.015))
+    assert track.wild >= 25
+    assert set(track.segment.tolist()) == {0}
+    found, _ = track.at(t[20:-20])
+    assert (
+        float(np.max(np.linalg.norm(found - np.column_stack([0.2 * t, np.sin(0.2 * t)])[20:-20], axis=1)))
+        < 0.06
+    )
+    xy[300:] += (0.0, jump_m)
+    track = PoseTrack(t, xy, np.full(len(t), 0.015))
+    assert set(track.segment.tolist()) == {0, 1}
+    begin = track.t_s[np.argmax(track.segment)]
+    assert abs(begin - 30.0) < 0.5
+    assert track.segment_at(np.array([20.0, 40.0, 99.0])).tolist() == [0, 1, -1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("latency_s", [-1.7, 1.7])
+def test_time_offsets_up_to_two_seconds_are_found(latency_s: float) -> None:
+    scene = simulate("random", 3, latency_s=latency_s)
+    result = scene.mapper.solve()
+    assert result.status == "valid"
+    assert abs(result.time_offset_s - latency_s) < 0.03
+    assert true_deviation(scene, result) <= 0.03
+
+
+@pytest.mark.slow
+def test_after_a_relocalisation_the_robots_new_place_counts() -> None:
+    scene = simulate("random", 2, laps=3, jump_m=0.6)
+    result = scene.mapper.solve()
+    assert result.status == "valid"
+    assert true_deviation(scene, result) <= 0.03
 
 
 def test_relocalisation_jump_does_not_spoil_the_track() -> None:

@@ -75,10 +75,10 @@ def _breaks(
         return begins
     before, enough_before = _line_ends(t_s, xy_m, segment, range(-_LINE_REACH, 0))
     after, enough_after = _line_ends(t_s, xy_m, segment, range(_LINE_REACH))
-    gap_m = np.linalg.norm(after - before, axis=1)
     same = np.concatenate([[False], np.diff(segment) == 0])
-    limit_m = _BEND_M + _LINE_SIGMAS * sigma_m
-    for k in np.flatnonzero(same & enough_before & enough_after & (gap_m > limit_m)):
+    known = same & enough_before & enough_after
+    gap_m = np.where(known, np.linalg.norm(after - before, axis=1), 0.0)
+    for k in np.flatnonzero(gap_m > _BEND_M + _LINE_SIGMAS * sigma_m):
         near = np.abs(t_s - t_s[k]) <= _LINE_S
         begins[k] = gap_m[k] == np.max(gap_m[near])
     return begins

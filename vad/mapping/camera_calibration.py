@@ -85,6 +85,23 @@ class CameraCalibration:
         """Covariance of `position_m`, (3, 3), m^2."""
         return None if self.parameter_covariance is None else self.parameter_covariance[3:6, 3:6]
 
+    @property
+    def homography_covariance(self) -> FloatArray | None:
+        """Covariance of `map_from_image` row by row, (9, 9), to first order; it has unit norm."""
+        camera_from_map, lens, covariance = self.camera_from_map, self.intrinsics, self.parameter_covariance
+        if camera_from_map is None or lens is None or covariance is None:
+            return None
+        columns = [
+            (
+                floor_homography(*moved(lens, camera_from_map, step))
+                - floor_homography(*moved(lens, camera_from_map, -step))
+            ).ravel()
+            / (2.0 * size)
+            for size, step in zip(_STEPS, np.diag(_STEPS), strict=True)
+        ]
+        by_parameter = np.stack(columns, axis=-1)
+        return np.asarray(by_parameter @ covariance @ by_parameter.T, dtype=np.float64)
+
     def floor_point(self, image_px: ArrayLike, sigma_px: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Where raw pixels lie on the floor, calibration uncertainty included.
 

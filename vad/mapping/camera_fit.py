@@ -199,8 +199,7 @@ def _conclude(
     # Larger than stated noise widens the covariance; smaller does not narrow it.
     scatter = max(1.0, float(np.sum(weight * np.sum(error**2, axis=1))) / freedom)
     covariance = np.zeros((len(free), len(free)))
-    # Frames between the same two poses see the same pose error: they count once.
-    shared = len(error) / len(np.unique(track.interval(sightings.t_s + at.time_offset_s)))
+    shared = _shared(sightings.t_s + at.time_offset_s, track)
     covariance[np.ix_(free, free)] = inverse * scatter * shared
     # Leave-one-out to first order: r / (1 - leverage), two by two.
     chosen = jacobian[:, :, free]
@@ -209,6 +208,18 @@ def _conclude(
     shrink = np.linalg.solve(np.eye(2) - np.minimum(leverage, 0.9), error[:, :, None])
     left_out = np.linalg.solve(whiten, shrink)[:, :, 0]
     return Fit(at, covariance, np.where(np.isfinite(predicted), left_out, np.nan))
+
+
+def _shared(t_s: FloatArray, track: PoseTrack) -> float:
+    """How many pairs count as one: frames between the same two poses see the same pose error.
+
+    How the robot strays between two poses is not shared by the frames between them.
+    """
+    per_interval = len(t_s) / len(np.unique(track.interval(t_s)))
+    _, sigma_m = track.at(t_s)
+    own_m = track.sigma_m[np.clip(track.interval(t_s) - 1, 0, len(track.sigma_m) - 1)]
+    common = float(np.mean(np.minimum(own_m**2 / sigma_m**2, 1.0)[np.isfinite(sigma_m)]))
+    return 1.0 + (per_interval - 1.0) * common
 
 
 def _whitened(at: Start, sightings: Sightings, track: PoseTrack, whiten: FloatArray) -> FloatArray:
