@@ -114,6 +114,7 @@ def targets() -> list[Target]:
         Target("agent's frame", frames.decode_frame, (AGENT_FRAME,)),
         Target("agent's command", frames.decode_command, (b'{"type":"Ack","stream":1,"next_seq":2}',)),
         Target("agent's time", frames.decode_time, (b'{"monotonic_ns":1,"boot":"x"}',)),
+        Target("wish", lambda d: decoded(d, m.DeviceWish, "fuzz"), WISHES),
         Target("client: heatmap", heatmap, (m.encode(heat),)),
         Target("client: grid", png_to_grid, (grid_to_png(np.zeros((5, 6), np.int8)),)),
         Target("client: array", npy_to_heatmap, (heatmap_to_npy(np.ones((3, 4), np.float32)),)),
@@ -157,6 +158,7 @@ SELECTORS = (
     b"since=2026-01-01;until=2026-02-01;limit=100",
     b"",
 )
+WISHES = (m.encode(m.DeviceWish(mac=MAC, name="lamp")), m.encode(m.DeviceWish(mac=MAC, forget=True)))
 AGENT_INFO = encode_info(AgentInfo(id="node", mac=MAC))
 AGENT_FRAME = frames.encode_frame(
     frames.Frame(

@@ -26,6 +26,8 @@ vad/home/devices/{MAC}            read   -     all
 vad/home/devices/{MAC}/heatmap    read   -     all
 vad/home/devices/*                read   -     all
 vad/*/devices/*                   read   -     all
+vad/home/devices/{MAC}/history    read   -     all
+vad/home/wishes                   -      -     all
 vad/home/cameras/main             read   -     all
 vad/home/cameras/main/frame       -      -     all
 vad/home/capture/s1               read   read  all
