@@ -16,6 +16,7 @@ from rich.table import Table
 
 from vad.geometry import Intrinsics, Rigid
 from vad.vision.body import Camera
+from vad.vision.path import smooth
 from vad.vision.people import PoseNetwork
 from vad.vision.standing import Standing, standing
 from vad.vision.tracks import Track, Tracker
@@ -91,12 +92,13 @@ def follow_video(console: Console, path: str, frames: int, picture: str | None) 
 
 
 def draw(image: NDArray[np.uint8], tracks: list[Track], camera: Camera) -> NDArray[np.uint8]:
-    """The tracks on a picture, each with its number where it ends."""
+    """The tracks' smooth paths on a picture, each with its number where it ends."""
     canvas = image.copy()
     for track in tracks:
         hue = np.uint8([[[(track.id * 180 // _TINTS * 4) % 180, 230, 255]]])
         tint = tuple(int(v) for v in cv2.cvtColor(hue, cv2.COLOR_HSV2BGR)[0, 0])
-        on_floor = np.column_stack([track.xy_m, np.zeros(len(track.xy_m))])
+        path = smooth(track, camera)
+        on_floor = np.column_stack([path.xy_m, np.zeros(len(path.xy_m))])
         px = camera.pixels(on_floor).round().astype(np.int32)
         cv2.polylines(canvas, [px], False, tint, 2, cv2.LINE_AA)
         end = (int(px[-1, 0]) + 4, int(px[-1, 1]) - 6)

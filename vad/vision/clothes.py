@@ -16,8 +16,8 @@ _SCORE_MIN = 0.2
 # OpenCV's 8-bit Lab; lightness more than hue.
 _SIGMA = np.array([20.0, 9.0, 9.0, 20.0, 9.0, 9.0])
 # However unlike they look, it may be the light: no colours speak louder than this.
-MOST_UNLIKE = 12.0
-_FOLLOW = 0.1
+MOST_UNLIKE = 8.0
+_FOLLOW = 0.04
 
 
 def clothes(image: Image, person: Person) -> FloatArray | None:

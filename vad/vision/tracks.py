@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vad.vision.body import Body
-from vad.vision.clothes import MOST_UNLIKE, remembered, unlikeness
+from vad.vision.clothes import remembered, unlikeness
 from vad.vision.standing import Standing
 
 FloatArray = NDArray[np.float64]
@@ -32,6 +32,8 @@ _ACCELERATION_M2_S3 = 0.5
 _BIRTH_SPEED_MPS = 0.8
 # Squared Mahalanobis distance that 99.97 % of a track's own points stay under (2 degrees of freedom).
 _GATE = 16.0
+# The cost of not seeing somebody: far off and in other clothes, it is somebody else.
+_MISSED = 20.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +180,7 @@ def _cv_noise(dt: float) -> FloatArray:
 
 
 def _assign(costs: FloatArray) -> list[int | None]:
-    """For each row (track) its column (person seen) or None: least total cost, nobody costing most of all.
+    """For each row (track) its column (person seen) or None: least total cost, nobody costing _MISSED.
 
     Exact, by dynamic programming over the points' subsets: fine for the six people a frame can hold.
     """
@@ -187,7 +189,7 @@ def _assign(costs: FloatArray) -> list[int | None]:
     for row in range(tracks):
         grown: dict[int, tuple[float, list[int | None]]] = {}
         for used, (total, chosen) in best.items():
-            options: list[tuple[int, float, int | None]] = [(used, total + _GATE + MOST_UNLIKE, None)]
+            options: list[tuple[int, float, int | None]] = [(used, total + _MISSED, None)]
             for k in range(points):
                 if not used >> k & 1 and np.isfinite(costs[row, k]):
                     options.append((used | 1 << k, total + float(costs[row, k]), k))
