@@ -17,6 +17,7 @@ Positive = Annotated[float, Meta(gt=0)]
 Id = Annotated[str, Meta(pattern="^[A-Za-z0-9_-]{1,64}$")]
 MacText = Annotated[str, Meta(pattern="^[0-9A-Fa-f]{2}(:[0-9A-Fa-f]{2}){5}$")]
 
+AbsolutePath = Annotated[str, Meta(pattern="^/")]
 Ipv4Text = Annotated[str, Meta(pattern=r"^((25[0-5]|2[0-4]\d|1?\d?\d)(\.(?!$)|$)){4}$")]
 
 
@@ -184,14 +185,14 @@ class DeviceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     hostapd: control sockets, e.g. /run/hostapd/wlan0. nl80211: access point interfaces that the kernel tells
     of, for those without a control socket. leases: dnsmasq's lease files, for names and addresses; where
     neither of the others is given, a lease lets its device join. agents: remote CSI nodes join, too. makers:
-    a list of makers (IEEE's oui.txt, nmap's, Wireshark's); left out: the system's.
+    a list of makers (absolute path of IEEE's oui.txt, nmap's or Wireshark's); left out: the system's.
     """
 
     hostapd: tuple[str, ...] = ()
     nl80211: tuple[str, ...] = ()
     leases: tuple[str, ...] = ()
     agents: bool = True
-    makers: str | None = None
+    makers: AbsolutePath | None = None
     static: tuple[StaticDevice, ...] = ()
     ignore: tuple[MacText, ...] = ()
 

@@ -27,6 +27,8 @@ _MANUF = re.compile(
     r"((?:[0-9A-F]{2}:){2,5}[0-9A-F]{2})(?:/(\d\d))?\s+(\S[^\t]*)(?:\t+(\S.*))?", re.IGNORECASE
 )
 
+_HEX = frozenset("0123456789abcdefABCDEF")
+
 Prefixes = dict[tuple[int, int], str]
 """(bits, value of the first so many bits) -> maker."""
 
@@ -35,7 +37,7 @@ def parse_makers(lines: Iterable[str]) -> Prefixes:
     """The makers in a list of one of the three kinds; lines of no kind are left out."""
     found: Prefixes = {}
     for line in lines:
-        entry = _entry(line.strip())
+        entry = _entry(line) if line[:1] in _HEX else None  # oui.txt's addresses of makers begin with tabs
         if entry is not None:
             bits, value, name = entry
             found[bits, value] = " ".join(name.split())[:MAX_NAME]
@@ -43,16 +45,20 @@ def parse_makers(lines: Iterable[str]) -> Prefixes:
 
 
 def _entry(line: str) -> tuple[int, int, str] | None:
-    if match := _IEEE.fullmatch(line):
-        return 24, int(match[1].replace("-", ""), 16), match[2]
-    if match := _MANUF.fullmatch(line):
-        digits = match[1].replace(":", "")
-        whole = 4 * len(digits)
-        bits = int(match[2] or whole)
-        return None if bits > whole else (bits, int(digits, 16) >> (whole - bits), match[4] or match[3])
-    if match := _NMAP.fullmatch(line):
-        return 4 * len(match[1]), int(match[1], 16), match[2]
-    return None
+    line = line.rstrip()
+    if line[2:3] == "-":
+        match = _IEEE.fullmatch(line)
+        return None if match is None else (24, int(match[1].replace("-", ""), 16), match[2])
+    if line[2:3] != ":":
+        match = _NMAP.fullmatch(line)
+        return None if match is None else (4 * len(match[1]), int(match[1], 16), match[2])
+    match = _MANUF.fullmatch(line)
+    if match is None:
+        return None
+    digits = match[1].replace(":", "")
+    whole = 4 * len(digits)
+    bits = int(match[2] or whole)
+    return None if bits > whole else (bits, int(digits, 16) >> (whole - bits), match[4] or match[3])
 
 
 class Makers:
@@ -75,7 +81,7 @@ class Makers:
 
 
 def load_makers(places: Iterable[Path] = PLACES) -> Makers:
-    """The first list that is there, an empty one where none is. Blocking: some tenths of a second."""
+    """The first list that is there, an empty one where none is. Blocking: a tenth of a second."""
     for path in places:
         try:
             if path.stat().st_size > MAX_BYTES:
