@@ -40,6 +40,10 @@ OPEN_TIMEOUT_MS = 5000
 MAX_MESSAGE_BYTES = 64 * 1024 * 1024
 """What is put together from fragments, at most; zenoh's own limit is 1 GiB. A robot's map may be some MiB."""
 
+TX_BATCHES = 16
+"""64 KiB each, what may wait to be written to a link: 500 devices in one answer (0.6 MB) go out at once; with
+zenoh's own 2 the sender and its writer wait for each other, five times as long."""
+
 BLOCK_WAIT_US = 500_000
 """How long an answer waits for an asker that does not read, before zenoh cuts its link; it may come again."""
 
@@ -134,6 +138,7 @@ def plain_config(mode: Mode, *, listen: Iterable[str] = (), connect: Iterable[st
         "transport/link/tx/lease": LEASE_MS,
         "transport/unicast/open_timeout": OPEN_TIMEOUT_MS,
         "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
+        "transport/link/tx/queue/size/data": TX_BATCHES,
         f"{congestion}/block/wait_before_close": BLOCK_WAIT_US,
         f"{congestion}/drop/wait_before_drop": DROP_WAIT_US,
         f"{congestion}/drop/max_wait_before_drop_fragments": DROP_WAIT_FRAGMENT_US,

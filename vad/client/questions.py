@@ -206,7 +206,7 @@ class Questions:
 
 @contextmanager
 def _uncollected() -> Iterator[None]:
-    """No garbage collection amid the reading of thousands of small values: it finds none and takes longest."""
+    """No garbage collection while thousands of small values are read: it finds none and takes longest."""
     wanted = gc.isenabled()
     gc.disable()
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import logging
 import time
 from collections.abc import Callable, Coroutine
@@ -123,6 +124,8 @@ class Daemon:
         try:
             async with asyncio.TaskGroup() as group:
                 await self._start(group)
+                gc.collect()
+                gc.freeze()  # what is known by now is never looked through again: no pauses amid answers
                 notify("READY=1")
         except ExceptionGroup as broken:
             known, unknown = broken.split(VadError)
