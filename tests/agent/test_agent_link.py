@@ -193,6 +193,21 @@ async def test_an_agent_starts_before_its_hub_and_outlives_it(tmp_path: Path) ->
     card.close()
 
 
+async def test_an_agent_that_went_away_is_said_to_be_away(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vad.daemon.agents.SILENT_NS", SECOND_NS // 2)
+    port = free_port()
+    with router(port) as session:
+        async with hearing(session) as agents:
+            assert agents.why_away(MAC) == ""
+            async with running_node(port, tmp_path / "none.fifo"):
+                await there(agents)
+            await until(lambda: agents.card_of(MAC) is None, "it is gone")
+            assert agents.why_away(MAC) == "its agent attic is away"
+            await until(lambda: agents.health.detail == "attic: away", "the status says so")
+
+
 async def test_two_agents_cannot_have_one_card(tmp_path: Path) -> None:
     port = free_port()
     with router(port) as session:

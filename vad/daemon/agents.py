@@ -150,6 +150,10 @@ class Agents:
         now_ns = time.monotonic_ns()
         return next((card for card in self._cards.values() if card.mac == mac and card.there(now_ns)), None)
 
+    def why_away(self, mac: str) -> str:
+        """Why an agent's card that was there gives nothing; empty for any other address."""
+        return next((f"its agent {card.id} is away" for card in self._cards.values() if card.mac == mac), "")
+
     @contextlib.contextmanager
     def leading(self, card: RemoteCard, session: str) -> Iterator[Line]:
         """A line to the agent for one session; answers to sessions without a line are told off."""

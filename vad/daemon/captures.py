@@ -131,7 +131,9 @@ class Captures:
         if card is not None:
             return Hearing(card.heard_per_s(now_ns), self._traffic.reaches(mac), card.trouble)
         per_s = self._ears.heard_per_s(address, now_ns)
-        why = "" if per_s >= MIN_PACKETS_PER_S else self._ears.why_unheard(address, now_ns)
+        why = ""
+        if per_s < MIN_PACKETS_PER_S:
+            why = self._agents.why_away(address) or self._ears.why_unheard(address, now_ns)
         return Hearing(per_s, self._traffic.reaches(mac), why)
 
     async def _capture(self, macs: tuple[str, ...], track: int) -> None:
