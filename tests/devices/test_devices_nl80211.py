@@ -186,13 +186,23 @@ async def test_an_interface_becomes_an_access_point_later_and_goes(
         kernel.interfaces[4] = ("wlan1", ACCESS_POINT)
         kernel.send([fake.interface(4, "wlan1", ACCESS_POINT)])
         await until(lambda: "wlan0 is no access point" in source.health.detail)
-        kernel.interfaces[3] = ("wlan0", ACCESS_POINT)
-        kernel.associate(3, A, authorized=True)  # older kernels do not tell that it became one
+        kernel.interfaces[3] = ("wlan0", ACCESS_POINT)  # the kernel does not tell that it became one
+        kernel.associate(3, A, authorized=True)
         assert await take(out) == ("joined", A, "wlan0")
         await until(lambda: source.health.state == "ok")
         kernel.interfaces.pop(3)
         kernel.send([fake.interface(3, "wlan0", ACCESS_POINT, command=8)])
         assert await take(out) == ("left", A, "wlan0")
+
+
+async def test_that_an_interface_became_an_access_point_no_event_tells(
+    kernel: FakeKernel, source: Nl80211Source
+) -> None:
+    kernel.interfaces = {3: ("wlan0", STATION), 4: ("wlan1", ACCESS_POINT)}
+    async with running(source, Events(1)):
+        await until(lambda: "wlan0 is no access point" in source.health.detail)
+        kernel.interfaces[3] = ("wlan0", ACCESS_POINT)
+        await until(lambda: source.health.state == "ok")
 
 
 async def test_after_a_lost_connection_everything_is_read_anew(

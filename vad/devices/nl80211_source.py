@@ -25,6 +25,8 @@ ASK_FACTOR = 2.0
 ASK_LAST_S = 1.0
 ASK_NO_MORE_S = 20.0
 """... and ever more rarely, until no handshake takes so long."""
+LOOK_S = 2.0
+"""How often an interface that is no access point is looked at again: that it became one, no event tells."""
 REPLY_S = 2.0
 RETRY_FIRST_S = 0.5
 RETRY_FACTOR = 2.0
@@ -143,14 +145,21 @@ class Nl80211Source:
             if self._reread:
                 await self._read_interfaces(link, out)
             try:
-                async with asyncio.timeout(self._ask_s if self._asked else None):
+                async with asyncio.timeout(self._patience_s()):
                     self._event(await self._next(link), out)
             except TimeoutError:
+                self._reread = self.health.state != "ok"
                 self._ask_s = min(self._ask_s * ASK_FACTOR, ASK_LAST_S)
                 for index in {index for index, _ in self._asked}:
                     await self._list(link, index, out)
                 now_s = loop.time()
                 self._asked = {one: until_s for one, until_s in self._asked.items() if until_s > now_s}
+
+    def _patience_s(self) -> float | None:
+        """How long nothing is asked where nothing comes; None: for ever."""
+        if self._asked:
+            return self._ask_s
+        return None if self.health.state == "ok" else LOOK_S
 
     async def _ask(
         self, link: _Link, request: Callable[[int], bytes], out: DropOldestQueue[StationEvent]
