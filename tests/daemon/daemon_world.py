@@ -129,6 +129,11 @@ class Vad:
         return self.log.read_text()
 
     @property
+    def pid(self) -> int:
+        """Of the process."""
+        return self._process.pid
+
+    @property
     def running(self) -> bool:
         """True until it has ended."""
         return self._process.poll() is None
