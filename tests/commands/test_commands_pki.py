@@ -12,6 +12,8 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from vad.commands.app import app
+from vad.commands.doctor import Visit, check_certificates
+from vad.config import parse_settings
 from vad.pki.certificates import utc_now
 from vad.pki.folder import PkiFolder
 
@@ -172,3 +174,28 @@ def test_an_expired_hub_certificate_is_said(hub: Path) -> None:
     assert "expired: vad pki rotate hub" in result.stdout
     fine("rotate", "hub")
     assert run("list").exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("age_days", "issue", "verdict", "words"),
+    [
+        (None, False, "bad", "vad pki init"),
+        (0, False, "warning", "vad pki issue"),
+        (0, True, "ok", "1 in force"),
+        (400, True, "bad", "Is the clock right"),
+    ],
+)
+async def test_the_doctor_looks_at_certificates(
+    hub: Path, age_days: int | None, issue: bool, verdict: str, words: str
+) -> None:
+    listen = "bus: {listen: ['tcp/127.0.0.1:7447', 'tls/0.0.0.0:7448']}\n"
+    pki = PkiFolder(hub / "state" / "pki")
+    if age_days is not None:
+        pki.init("cottage", ["h"], utc_now() - timedelta(days=age_days))
+    if issue:
+        pki.issue("viewer", "tablet", 1, utc_now())
+    visit = Visit(parse_settings(SETTINGS + listen, where="vad.yaml"), hub / "vad.yaml", 0.1)
+    (finding,) = await check_certificates(visit)
+    assert finding.verdict == verdict
+    assert words in finding.text + finding.remedy
+    assert await check_certificates(Visit(parse_settings(SETTINGS, where=""), hub / "vad.yaml", 0.1)) == []

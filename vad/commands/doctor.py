@@ -18,8 +18,10 @@ from rich.text import Text
 from vad.commands.console import EXIT_NOTHING, JsonOption, out, print_json, reported_errors
 from vad.commands.robot import running_robot
 from vad.commands.run import DEFAULT_CONFIG, ConfigOption
-from vad.config import Ros2Robot, Settings, load_settings, resolve
+from vad.config import Ros2Robot, Settings, load_settings, pki_folder, resolve
 from vad.errors import VadError
+from vad.pki.certificates import days_left, utc_now
+from vad.pki.folder import PkiFolder
 from vad.report.words import printable
 from vad.robot.map_server import load_floor_plan, load_rooms
 from vad.robot.pose import MapSource, RobotPose
@@ -139,7 +141,32 @@ async def check_robot(visit: Visit) -> list[Finding]:
         return found
 
 
-CHECKS: tuple[Check, ...] = (check_floor_plan, check_serial_port, check_router, check_robot)
+async def check_certificates(visit: Visit) -> list[Finding]:
+    """Whether clients on the network can be let in, where the settings listen there."""
+    if not any(endpoint.startswith("tls/") for endpoint in visit.settings.bus.listen):
+        return []
+    now = utc_now()
+    try:
+        files = PkiFolder(pki_folder(visit.settings, visit.config_file)).hub_files()
+    except VadError as error:
+        return [Finding("certificates", "bad", f"{error.where}: {error.what}", error.remedy)]
+    days = days_left(files.ends_at, now)
+    count = len(files.register.in_force(now))
+    told = f"{count} in force; the hub's ends in {days:.0f} days"
+    if days <= 0:
+        return [Finding("certificates", "bad", told, "Is the clock right? If so: `vad pki rotate hub`")]
+    if not count:
+        return [Finding("certificates", "warning", told, "`vad pki issue viewer NAME` lets somebody in")]
+    return [Finding("certificates", "ok", told)]
+
+
+CHECKS: tuple[Check, ...] = (
+    check_floor_plan,
+    check_certificates,
+    check_serial_port,
+    check_router,
+    check_robot,
+)
 
 
 def doctor(
