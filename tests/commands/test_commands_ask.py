@@ -20,7 +20,9 @@ from typer.testing import CliRunner
 from vad.bus import messages as m
 from vad.bus.grid import grid_to_png
 from vad.bus.node import Bus
+from vad.bus.selectors import HistoryQuestion
 from vad.bus.session import BusSettings
+from vad.commands.device_past import heatmap, history
 from vad.commands.devices import devices
 from vad.commands.map import map_
 from vad.commands.status import status
@@ -33,6 +35,8 @@ app = typer.Typer()
 app.command("devices")(devices)
 app.command("map")(map_)
 app.command("status")(status)
+app.command("history")(history)
+app.command("heatmap")(heatmap)
 
 
 @pytest.fixture
@@ -191,6 +195,93 @@ async def test_status_tells_the_parts_and_whether_all_is_well(endpoint: str) -> 
         assert (
             json.loads((await run(endpoint, "status", "--json", code=1))[0])["parts"][1]["part"] == "camera"
         )
+
+
+async def test_status_tells_rates_losses_and_since_when(endpoint: str) -> None:
+    csi = m.Part(
+        part="csi",
+        state="ok",
+        last_error="unplugged",
+        last_error_at="2026-01-31T12:00:00.000Z",
+        counters={"packets": 4000, "lost": 7},
+        rates_per_s={"packets": 398.5},
+        latencies={"batch": m.Latency(count=9, total_s=0.1, p50_ms=0.5, p99_ms=12.25, max_ms=13.0)},
+    )
+    async with Bus(BusSettings(listen=(endpoint,))) as bus:
+        bus.publish_status(m.StatusMessage(source="live", version="1", uptime_s=1.0, parts=(csi,)))
+        text, _ = await run(endpoint, "status")
+        assert "2026-01-31T12:00:00.000Z: unplugged" in text
+        assert "lost 7, packets 4000 (398.5/s)" in text
+        assert "batch 0.5 / 12.25" in text
+
+
+NOON = "2026-01-31T12:00:00.000Z"
+
+
+class Memory:
+    """What a store would know: the TV, mapped since noon."""
+
+    async def devices_at(self, at: str, mac: str | None) -> list[m.DeviceMessage]:
+        if mac not in (None, TV) or at < NOON:
+            return []
+        return [m.DeviceMessage(source="live", mac=TV, name="old TV", state="mapped", x_m=1.0, y_m=1.0)]
+
+    async def history(self, mac: str, question: HistoryQuestion) -> m.HistoryMessage | None:
+        entry = m.HistoryEntry(at=NOON, state="mapped", epoch=2, x_m=1.0, y_m=1.25, room="Hall", walks=3)
+        entries = (entry,) * (question.since is None)
+        return m.HistoryMessage(source="live", mac=mac, entries=entries) if mac == TV else None
+
+
+async def test_devices_narrowed_then_and_as_geojson(endpoint: str) -> None:
+    async with Bus(BusSettings(listen=(endpoint,))) as bus:
+        fill(bus)
+        bus.ask_past(Memory())
+        boxed, _ = await run(endpoint, "devices", "--bbox", "5,0,8,3")
+        assert [line[:17] for line in boxed.splitlines()[1:]] == [LAMP]
+        one, _ = await run(endpoint, "devices", "--mac", PHONE.upper())
+        assert [line[:17] for line in one.splitlines()[1:]] == [PHONE]
+        assert (
+            "no device fits" in (await run(endpoint, "devices", "--since", "2099-01-01T00:00:00Z", code=1))[1]
+        )
+        then, _ = await run(endpoint, "devices", "--at", "2026-01-31T13:00:00+01:00")
+        assert "old TV" in then
+        assert "no device fits" in (await run(endpoint, "devices", "--at", "2026-01-31T11:59:59Z", code=1))[1]
+        places = json.loads((await run(endpoint, "devices", "--geojson", "--room", "Kitchen"))[0])
+        assert [(f["id"], f["geometry"]["coordinates"]) for f in places["features"]] == [(LAMP, [6.0, 1.5])]
+        assert "not a box" in (await run(endpoint, "devices", "--bbox", "1,2,3", code=2))[1]
+        assert "not an RFC 3339 time" in (await run(endpoint, "devices", "--at", "noon", code=2))[1]
+        assert "--geojson goes" in (await run(endpoint, "devices", "--geojson", "--watch", code=2))[1]
+
+
+async def test_the_history_of_a_device(endpoint: str) -> None:
+    async with Bus(BusSettings(listen=(endpoint,))) as bus:
+        assert "keeps no history" in (await run(endpoint, "history", TV, code=2))[1]
+        bus.ask_past(Memory())
+        text, _ = await run(endpoint, "history", TV)
+        assert re.search(rf"{NOON} +mapped +Hall +1\.00 +1\.25 +– +3 +2", text)
+        assert json.loads((await run(endpoint, "history", TV, "--json"))[0])["entries"][0]["walks"] == 3
+        assert "nothing is kept" in (await run(endpoint, "history", TV, "--since", NOON, code=1))[1]
+        assert "does not know" in (await run(endpoint, "history", LAMP, code=1))[1]
+
+
+async def test_a_heatmap_becomes_a_file(endpoint: str, tmp_path: Path) -> None:
+    heat = m.heatmap_message(
+        np.arange(1.0, 7.0).reshape(2, 3), source="live", mac=TV, epoch=1, bounds_m=(0, 0, 3, 2), step_m=1
+    )
+    async with Bus(BusSettings(listen=(endpoint,))) as bus:
+        bus.publish_heatmap(heat)
+        for name in ("tv.png", "tv.npy", "tv.json"):
+            text, _ = await run(endpoint, "heatmap", TV, str(tmp_path / name))
+            assert text == f"wrote {tmp_path / name}\n"
+        picture = cv2.imread(str(tmp_path / "tv.png"), cv2.IMREAD_UNCHANGED)
+        assert picture is not None
+        assert picture.shape == (2, 3, 4)
+        np.testing.assert_allclose(
+            np.load(tmp_path / "tv.npy"), np.arange(1, 7).reshape(2, 3) / 21, rtol=1e-6
+        )
+        assert json.loads((tmp_path / "tv.json").read_text())["bounds_m"] == [0, 0, 3, 2]
+        assert "does not end in" in (await run(endpoint, "heatmap", TV, "tv.jpg", code=2))[1]
+        assert "yet" in (await run(endpoint, "heatmap", LAMP, str(tmp_path / "lamp.png"), code=1))[1]
 
 
 async def test_the_map_in_words(endpoint: str) -> None:

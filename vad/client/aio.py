@@ -139,7 +139,11 @@ class AsyncVadClient:
 
     async def heatmap_png(self, mac: str) -> bytes | None:
         """A device's posterior as a picture, one pixel a cell, to lay over the map; None: none yet."""
-        return await self._ask(self._questions.heatmap_png(mac))
+        return await self.heatmap_bytes(mac, "png")
+
+    async def heatmap_bytes(self, mac: str, form: str) -> bytes | None:
+        """A device's posterior as it is sent: `png`, `npy` or `json`; None: none yet."""
+        return await self._ask(self._questions.heatmap_bytes(mac, form))
 
     async def heatmap_array(self, mac: str) -> NDArray[np.float32] | None:
         """A device's posterior: (height, width), row 0 at the lowest y, sums to 1; None: none yet."""

@@ -120,13 +120,13 @@ class Questions:
         """A posterior as a message."""
         return self._one(self._keys.heatmap(mac), m.HeatmapMessage)
 
-    def heatmap_png(self, mac: str) -> Question[bytes | None]:
-        """A posterior as a picture."""
-        return self._bytes(_selector(self._keys.heatmap(mac), "format=png"))
+    def heatmap_bytes(self, mac: str, form: str) -> Question[bytes | None]:
+        """A posterior as it is sent in a form of HEATMAP_FORMATS."""
+        return self._bytes(_selector(self._keys.heatmap(mac), f"format={form}"))
 
     def heatmap_array(self, mac: str) -> Question[NDArray[np.float32] | None]:
         """A posterior as an array."""
-        raw = self._bytes(_selector(self._keys.heatmap(mac), "format=npy"))
+        raw = self.heatmap_bytes(mac, "npy")
 
         def read(found: Payloads) -> NDArray[np.float32] | None:
             payload = raw.read(found)

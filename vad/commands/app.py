@@ -11,6 +11,7 @@ from vad.commands.camera import app as camera_app
 from vad.commands.csi import csi_app
 from vad.commands.demo import demo
 from vad.commands.device import device_app
+from vad.commands.device_past import heatmap, history
 from vad.commands.devices import devices
 from vad.commands.doctor import doctor
 from vad.commands.map import map_app
@@ -51,6 +52,8 @@ app.command("check-config")(check_config)
 app.command()(agent)
 app.command()(devices)
 app.add_typer(device_app, name="device")
+device_app.command()(history)
+device_app.command()(heatmap)
 app.add_typer(map_app, name="map")
 app.command()(status)
 app.command()(replay)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypedDict
 
 import msgspec
 import typer
@@ -16,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from vad.bus.messages import DeviceMessage, Point
-from vad.bus.selectors import STATES
+from vad.bus.selectors import STATES, Bbox
 from vad.client import VadClient
 from vad.commands.console import (
     ANY_HUB,
@@ -47,6 +46,16 @@ STATE_STYLES = {
 }
 
 
+class _Wanted(TypedDict):
+    room: Sequence[str]
+    state: Sequence[str]
+    mac: Sequence[str]
+    max_sigma_m: float | None
+    since: str | None
+    bbox: Bbox | None
+    at: str | None
+
+
 class _TruePlace(msgspec.Struct, frozen=True):
     x_m: float
     y_m: float
@@ -70,6 +79,21 @@ def devices(
             metavar="FILE",
         ),
     ] = None,
+    mac: Annotated[list[str] | None, typer.Option(help="Only this device (may repeat).")] = None,
+    bbox: Annotated[
+        str | None,
+        typer.Option(help="Only devices placed in this box: metres of the map.", metavar="X0,Y0,X1,Y1"),
+    ] = None,
+    since: Annotated[
+        str | None, typer.Option(help="Only devices that changed after this time (RFC 3339).", metavar="TIME")
+    ] = None,
+    at: Annotated[
+        str | None, typer.Option(help="As they were at this time (RFC 3339).", metavar="TIME")
+    ] = None,
+    geojson: Annotated[
+        bool,
+        typer.Option("--geojson", help="A GeoJSON FeatureCollection; coordinates are metres of the map."),
+    ] = False,
     endpoint: EndpointOption = ENDPOINT,
     hub: HubOption = ANY_HUB,
 ) -> None:
@@ -77,12 +101,37 @@ def devices(
 
     Example:  vad devices --room Kitchen --state mapped
 
+    Example:  vad devices --at 2026-01-31T20:00:00+01:00
+
+    Example:  vad devices --geojson > home.geojson
+
     Exit code 0: devices were found; 1: none; 2: an option cannot be used; 3: no daemon answers.
     """
     with reported_errors():
         places = {} if truth is None else read_truth(truth)
-        ask = partial(_ask, room=room or (), state=state or (), max_sigma_m=max_sigma)
+        wanted: _Wanted = {
+            "room": room or (),
+            "state": state or (),
+            "mac": mac or (),
+            "max_sigma_m": max_sigma,
+            "since": since,
+            "bbox": None if bbox is None else read_bbox(bbox),
+            "at": at,
+        }
+        narrowed = any(value is not None and value != () for value in wanted.values())
+
+        def ask(asked: VadClient) -> list[DeviceMessage]:
+            return asked.devices(**wanted)
+
+        if geojson and (keep_watching or truth is not None):
+            raise VadError("--geojson goes neither with --watch nor with --truth")
         with VadClient(endpoint, hub) as client:
+            if geojson:
+                features = client.devices_geojson(**wanted)
+                print_json(features)
+                if not features["features"]:
+                    raise typer.Exit(EXIT_NOTHING)
+                return
             if keep_watching and as_json:
                 watch_json(client, lambda c: [_as_json(device, places) for device in ask(c)])
                 return
@@ -95,9 +144,18 @@ def devices(
     elif found:
         out.print(device_table(found, places))
     else:
-        complain("no device fits" if room or state or max_sigma is not None else "no device is known yet")
+        complain("no device fits" if narrowed else "no device is known yet")
     if not found:
         raise typer.Exit(EXIT_NOTHING)
+
+
+def read_bbox(text: str) -> Bbox:
+    """`x0,y0,x1,y1` as numbers; VadError for anything else."""
+    try:
+        x0, y0, x1, y1 = map(float, text.split(","))
+    except ValueError:
+        raise VadError("not a box", where=f"--bbox {text}", remedy="Write x0,y0,x1,y1 in metres") from None
+    return x0, y0, x1, y1
 
 
 def read_truth(path: Path) -> dict[str, Point]:
@@ -160,12 +218,6 @@ def device_table(found: Sequence[DeviceMessage], truth: Mapping[str, Point]) -> 
         f"{inside} of {len(errors)} inside their 90 % radius"
     )
     return Group(table, Text(summary, style="bold"))
-
-
-def _ask(
-    client: VadClient, room: Sequence[str], state: Sequence[str], max_sigma_m: float | None
-) -> list[DeviceMessage]:
-    return client.devices(room=room, state=state, max_sigma_m=max_sigma_m)
 
 
 def _error_m(device: DeviceMessage, truth: Mapping[str, Point]) -> float | None:

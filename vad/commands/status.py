@@ -10,7 +10,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from vad.bus.messages import StatusMessage
+from vad.bus.messages import Part, StatusMessage
 from vad.client import VadClient
 from vad.commands.console import (
     ANY_HUB,
@@ -30,6 +30,8 @@ from vad.commands.console import (
 from vad.report.words import duration, printable
 
 STATE_STYLES = {"ok": "bold green", "starting": "yellow", "degraded": "bold yellow", "failed": "bold red"}
+LOSSES = ("dropped", "lost", "refused", "failed", "broken", "died")
+"""A counter with one of these words in its name counts what should not be."""
 _JUST_STARTED = "the daemon has just started and says nothing of itself yet"
 
 
@@ -75,22 +77,41 @@ def status_table(found: StatusMessage) -> RenderableType:
     table = Table(header_style="bold", box=None, pad_edge=False)
     for name in ("Part", "State"):
         table.add_column(name, no_wrap=True)
-    for name in ("Detail", "Last error", "Counters"):
+    for name in ("Detail", "Last error", "Counters (a second)", "Took ms, median / p99"):
         table.add_column(name, overflow="fold")
     for part in found.parts:
-        counters = ", ".join(f"{name} {count}" for name, count in sorted(part.counters.items()))
-        repeated = part.last_error == part.detail
+        took = ", ".join(f"{work} {t.p50_ms:g} / {t.p99_ms:g}" for work, t in sorted(part.latencies.items()))
         table.add_row(
             Text(printable(part.part)),
             Text(part.state, style=STATE_STYLES[part.state]),
             Text(printable(part.detail)),
-            Text("" if repeated else printable(part.last_error), style="dim"),
-            Text(printable(counters), style="dim"),
+            Text(printable(_last_error(part)), style="dim"),
+            _counters(part),
+            Text(printable(took), style="dim"),
         )
     lines: list[RenderableType] = [heading]
     if found.step:
         lines.append(Text(f"now: {printable(found.step)}"))
     return Group(*lines, Text(""), table)
+
+
+def _last_error(part: Part) -> str:
+    """The reason for the last trouble, where the detail does not tell it now, and since when."""
+    if not part.last_error:
+        return ""
+    since = f"{part.last_error_at}: " if part.last_error_at else ""
+    return since.rstrip(": ") if part.last_error == part.detail else since + part.last_error
+
+
+def _counters(part: Part) -> Text:
+    """Every counter with its rate; what counts losses stands out where there are any."""
+    told = Text(style="dim")
+    for name, count in sorted(part.counters.items()):
+        rate = f" ({part.rates_per_s[name]:g}/s)" if name in part.rates_per_s else ""
+        loss = count > 0 and any(word in name for word in LOSSES)
+        told.append(", " if told.plain else "")
+        told.append(printable(f"{name} {count}{rate}"), style="yellow" if loss else "")
+    return told
 
 
 def _plain(client: VadClient) -> Any:
