@@ -23,6 +23,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 NICENESS = 10
+WIDTH = 132
 BANDS = ((NEAR_M, FAR_M), (2.0, 3.0), (3.0, 4.0), (4.0, 5.0), (5.0, 6.0))
 BARS = {"median_m": 0.05, "p95_m": 0.15, "slow_rms_m": 0.03}
 BUSY_SHARE, IDLE_SHARE, LATENCY_MS = 0.60, 0.08, 60.0
@@ -147,10 +148,11 @@ def main() -> int:
     parser.add_argument("--only-speed", action="store_true", help="the timings alone")
     parser.add_argument("--json", action="store_true", help="figures as JSON")
     parser.add_argument("--video", help="vtest.avi of Debian's opencv-doc: follow its pedestrians instead")
-    parser.add_argument("--frames", type=int, default=150, help="with --video: so many frames (150)")
+    parser.add_argument("--frames", type=int, default=125, help="with --video: so many pictures (125)")
     parser.add_argument("--picture", help="with --video: draw the tracks into this PNG or JPEG")
     given = parser.parse_args()
     console = Console()
+    console.width = max(console.width, WIDTH)
     if given.video:
         return follow_video(console, given.video, given.frames, given.picture)
     cv2.setNumThreads(1)
