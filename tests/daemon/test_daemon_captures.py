@@ -20,6 +20,7 @@ from vad.capture.archive import CUT_OFF, sessions_in, total_bytes
 from vad.capture.session import SCHEMA, SessionAnchor, SessionDevice, SessionHeader, load_session
 from vad.capture.session_writer import SessionWriter
 from vad.daemon.decisions import read
+from vad.mapping.posterior import Grid, Posterior
 from vad.sim.household import Household, Visit, hear, make_household
 from vad.sim.render import Renderer
 from vad.vision.people import PoseNetwork
@@ -29,6 +30,12 @@ HOME = HOUSE.home
 LAMP, TV = HOUSE.devices[0], HOUSE.devices[1]
 VISIT = HOUSE.visits[0]
 S = 1_000_000_000
+GRID = Grid.over(HOUSE.plan.bounds_m, 0.1)
+EARLIER = Posterior(
+    GRID,
+    (-((GRID.points_m - LAMP.place_m(0.0)[:2]) ** 2).sum(axis=1) / 2).reshape(GRID.rows, GRID.columns),
+)
+"""What an earlier walk said of the lamp: one metre of standard deviation."""
 SHORT = {"min_s": 3.0, "max_s": 6.0, "mapped_radius_m": 5.0, "min_walks": 1}
 
 
@@ -38,12 +45,14 @@ def network() -> PoseNetwork:
 
 
 async def _play(world: Hub, house: Household, visit: Visit, rates: Mapping[str, float]) -> None:
-    """The visit from its third second on, for the eyes and the ears, in real time."""
+    """The visit from its third second on, for the eyes and the ears, in real time; again and again, for on a
+    busy machine one may be seen in too few frames."""
     renderer = await asyncio.to_thread(Renderer, replace(house.home, walks=(visit.walk,)))
-    from_s = visit.walk.start_s + 3.0
-    start_ns = time.monotonic_ns() - int(from_s * S)
-    number, t_s = 0, from_s
+    number, t_s, start_ns = 0, float("inf"), 0
     while True:
+        if t_s > visit.walk.end_s + 3.0:
+            t_s = visit.walk.start_s + 3.0
+            start_ns = time.monotonic_ns() - int(t_s * S)
         image = await asyncio.to_thread(renderer.frame, t_s)
         until_s = (time.monotonic_ns() - start_ns) / S
         batch = await asyncio.to_thread(hear, house, visit, rates, t_s, until_s)
@@ -66,6 +75,7 @@ async def playing(world: Hub, rates: Mapping[str, float]) -> AsyncIterator[None]
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(200)
 async def test_one_walk_measures_two_devices_and_tells_its_story(
     tmp_path: Path, network: PoseNetwork
 ) -> None:
@@ -74,11 +84,11 @@ async def test_one_walk_measures_two_devices_and_tells_its_story(
         for device in (LAMP, TV):
             await world.registry.joined(device.mac, device.name)
         async with playing(world, {LAMP.mac: 150.0, TV.mac: 150.0}):
-            await until(lambda: world.captures.step.startswith("recording a walk for lamp, tv"), "both", 15)
+            await until(lambda: world.captures.step.startswith("recording a walk for lamp, tv"), "both", 60)
             walks = lambda mac: world.registry.get(mac).walks  # noqa: E731
-            await until(lambda: walks(LAMP.mac) == walks(TV.mac) == 1, "both are solved", 30)
-    sessions = sessions_in(tmp_path / "sessions")
-    assert [(s.state, s.name) for s in sessions] == [("done", "lamp"), ("done", "tv")]
+            await until(lambda: walks(LAMP.mac) == walks(TV.mac) == 1, "both are solved", 60)
+    sessions = [s for s in sessions_in(tmp_path / "sessions") if s.state == "done"][:2]
+    assert [s.name for s in sessions] == ["lamp", "tv"]
     assert total_bytes(sessions) < 0.6 * sum(s.bytes for s in sessions), "their bytes are shared"
     for session, device in zip(sessions, (LAMP, TV), strict=True):
         loaded = load_session(session.folder)
@@ -96,22 +106,38 @@ async def test_one_walk_measures_two_devices_and_tells_its_story(
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(200)
 async def test_a_mapped_device_stays_mapped_while_it_is_looked_at_again(
     tmp_path: Path, network: PoseNetwork
 ) -> None:
     limits = SHORT | {"recheck_h": 0.0001}
     async with hub(tmp_path, network, true_calibration(HOME), capture=limits) as world:
         await world.registry.joined(LAMP.mac, "lamp")
-        states = set()
+        await world.registry.add_evidence(LAMP.mac, EARLIER, 4000, 15.0)
+        states = {world.registry.get(LAMP.mac).state}
         async with playing(world, {LAMP.mac: 200.0}):
-            await until(lambda: world.registry.get(LAMP.mac).state == "mapped", "it is mapped", 30)
 
             def checked() -> bool:
                 states.add(world.registry.get(LAMP.mac).state)
                 return "recording" in world.captures.step
 
-            await until(checked, "it is measured again", 20)
+            await until(checked, "it is measured again", 60)
         assert states == {"mapped"}
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(200)
+async def test_a_walk_ends_as_soon_as_the_place_is_sharp(tmp_path: Path, network: PoseNetwork) -> None:
+    """What an earlier walk said and the first seconds of this one are enough."""
+    limits = {"min_s": 3.0, "max_s": 60.0, "mapped_radius_m": 5.0, "min_walks": 2}
+    async with hub(tmp_path, network, true_calibration(HOME), capture=limits) as world:
+        await world.registry.joined(LAMP.mac, "lamp")
+        await world.registry.add_evidence(LAMP.mac, EARLIER, 4000, 15.0)
+        async with playing(world, {LAMP.mac: 200.0}):
+            said = world.captures.parts[0].counters
+            await until(lambda: said["sharper"] > 0, "it is mapped", 60)
+    told = [line.text for line in read(tmp_path)]
+    assert any(line.endswith("s walked: sharp enough") for line in told), told
 
 
 async def test_what_a_crash_cut_off_is_said_at_the_next_start(tmp_path: Path, network: PoseNetwork) -> None:

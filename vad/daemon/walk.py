@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -30,11 +31,13 @@ from vad.daemon.threads import to_the_end
 from vad.errors import SessionError
 from vad.mapping.walk import WalkTrack
 
+_log = logging.getLogger(__name__)
+
 TICK_S = 0.1
 SAVE_WALK_NS = 2_000_000_000
 """How often the walk so far is written down, so that a crash leaves it."""
-LOOK_AHEAD_NS = 6_000_000_000
-"""How often it is worked out whether the walk is enough already."""
+LOOK_AHEAD_S = 3.0
+"""Between two looks whether the walk is enough already."""
 MARGIN_NS = 30_000_000_000
 """The camera gives up by itself so long after the longest walk."""
 JPEG_QUALITY = 85
@@ -243,13 +246,19 @@ class WalkRecorder:
         await asyncio.sleep(self._limits.min_s + GONE_S)
         while True:
             for mac, folder in zip(self.macs, self.writer.folders, strict=True):
-                with contextlib.suppress(SessionError, DeviceGoneError):  # the next look tells
+                try:
                     solved = await self._solver.solve(folder)
-                    if solved.posterior is not None and await self._findings.enough(mac, solved.posterior):
-                        self._sharp.add(mac)
-                    else:
-                        self._sharp.discard(mac)
-            await asyncio.sleep(LOOK_AHEAD_NS / 1e9)
+                    sharp = solved.posterior is not None and await self._findings.enough(
+                        mac, solved.posterior
+                    )
+                except (SessionError, DeviceGoneError) as error:
+                    _log.debug("%s is not ready yet: %s", folder, error)
+                    sharp = False
+                if sharp:
+                    self._sharp.add(mac)
+                else:
+                    self._sharp.discard(mac)
+            await asyncio.sleep(LOOK_AHEAD_S)
 
 
 def _write_remote(writer: WalkWriter, card: str, batches: list[CsiBatch], lost: int) -> None:
