@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from vad.errors import VadError
 from vad.vision.robot import disc_contact
 from vad.vision.robot_detector import RobotDetector
-from vad.vision.robot_outputs import Detections, Letterbox, layout_of, read_heat, suppress
+from vad.vision.robot_outputs import HEAT_CHANNELS, Detections, Letterbox, layout_of, read_heat, suppress
 
 NOBODY = np.empty((0, 4))
 
@@ -151,11 +151,15 @@ def test_suppression_keeps_the_best_and_nothing_twice(
 
 
 def test_peaks_of_a_heat_map() -> None:
-    output = np.zeros((1, 5, 10, 12), np.float32)
+    output = np.zeros((1, HEAT_CHANNELS, 10, 12), np.float32)
     output[0, 0, 3, 4], output[0, 0, 3, 5], output[0, 0, 8, 11] = 0.9, 0.8, 0.4
-    output[0, 1:, 3, 4] = (35.5, 27.5, 20.0, 10.0)
-    output[0, 1:, 8, 11] = (91.0, 67.0, 8.0, 8.0)
+    output[0, 1:, 3, 4] = (35.5, 27.5, 20.0, 10.0, 36.0, 29.5)
+    output[0, 1:, 8, 11] = (91.0, 67.0, 8.0, 8.0, 91.0, 68.0)
     found = read_heat(output, 0.3)
     assert found.scores.tolist() == pytest.approx([0.9, 0.4])
     assert found.boxes[0].tolist() == [26.0, 23.0, 46.0, 33.0]
+    assert found.contacts is not None
+    undone = Letterbox(0.5, 0.0, 0.0).undo(found, 200, 160)
+    assert undone.contacts is not None
+    assert undone.contacts[0].tolist() == [72.5, 59.5]
     assert not len(read_heat(output, 0.95).boxes)

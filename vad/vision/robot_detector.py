@@ -29,6 +29,7 @@ _PACKAGED_WIDTH = 384
 _PACKAGED_MULTIPLE = 16
 _OVERLAP = 0.5
 # Spread of the contact point, per width of the box: detectors' boxes are less exact than a blob's outline.
+_EDGE_PX = 1.0
 _SIGMA_PX = 1.0
 _SIGMA_PER_WIDTH = 0.06
 _WHERE = "vision.robot_detector"
@@ -89,7 +90,7 @@ class RobotDetector:
         return "packaged" if self._layout is None else self._layout.family
 
     def update(self, image: Image, people_boxes: FloatArray) -> list[RobotCandidate]:
-        """Candidates in a frame, the best first; in people's boxes are none.
+        """Candidates in a frame, the best first; none in people's boxes, none cut by the picture's edge.
 
         Args:
             image: (height, width, 3) uint8 BGR. people_boxes: (N, 4) x0, y0, x1, y1 in raw pixels.
@@ -97,11 +98,14 @@ class RobotDetector:
         people = np.asarray(people_boxes, dtype=np.float64).reshape(-1, 4)
         found = self.detect(image, self.threshold)
         candidates = []
-        for x0, y0, x1, y1 in found.boxes.tolist():
+        height, width = image.shape[:2]
+        for k, (x0, y0, x1, y1) in enumerate(found.boxes.tolist()):
             box = (x0, y0, x1, y1)
-            if x1 - x0 < 1.0 or y1 - y0 < 1.0 or touches_people(box, people):
+            # Cut by the picture's edge a box does not tell where the robot stands.
+            cut = x0 < _EDGE_PX or y0 < _EDGE_PX or x1 > width - 1 - _EDGE_PX or y1 > height - 1 - _EDGE_PX
+            if cut or x1 - x0 < 1.0 or y1 - y0 < 1.0 or touches_people(box, people):
                 continue
-            x_px, y_px = disc_contact(*box)
+            x_px, y_px = disc_contact(*box) if found.contacts is None else found.contacts[k].tolist()
             sigma_px = float(np.hypot(_SIGMA_PX, _SIGMA_PER_WIDTH * (x1 - x0)))
             candidates.append(RobotCandidate(x_px, y_px, sigma_px, box))
         return candidates[:MAX_CANDIDATES]

@@ -13,15 +13,24 @@ Family = Literal["yolov5", "yolov8", "yolox", "nms"]
 
 _STRIDES = (8, 16, 32)
 _ANCHORS = 3
+HEAT_CHANNELS = 7
+"""Heat 0..1; in input pixels: the box's middle x and y, its width and height, the floor contact's x and y."""
 _NMS_VALUES = 6
 
 
 @dataclass(frozen=True, slots=True)
 class Detections:
-    """Best first. boxes: (N, 4) x0, y0, x1, y1 in pixels; scores: (N,) 0..1."""
+    """Best first. boxes: (N, 4) x0, y0, x1, y1 in pixels; scores: (N,) 0..1; contacts: (N, 2) x, y of the
+    floor under the robot's middle, from networks that tell it."""
 
     boxes: FloatArray
     scores: FloatArray
+    contacts: FloatArray | None = None
+
+    def only(self, rows: list[int] | NDArray[np.int64]) -> Detections:
+        """These rows, in this order."""
+        contacts = None if self.contacts is None else self.contacts[rows]
+        return Detections(self.boxes[rows], self.scores[rows], contacts)
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +62,10 @@ class Letterbox:
         # Boxes count pixel edges from 0; the picture's pixels have their middles at whole numbers.
         boxes = (found.boxes - np.array([self.left, self.top] * 2)) / scale - 0.5
         limit = np.array([width, height] * 2) - 0.5
-        return Detections(np.clip(boxes, -0.5, limit), found.scores)
+        contacts = found.contacts
+        if contacts is not None:
+            contacts = (contacts - np.array([self.left, self.top])) / scale[:2] - 0.5
+        return Detections(np.clip(boxes, -0.5, limit), found.scores, contacts)
 
 
 def layout_of(shape: tuple[int, ...], size: tuple[int, int]) -> Layout | None:
@@ -78,7 +90,8 @@ def layout_of(shape: tuple[int, ...], size: tuple[int, int]) -> Layout | None:
 
 
 def read_heat(output: NDArray[np.float32], threshold: float) -> Detections:
-    """Our own network's output (1, 5, rows, columns): heat, middle x and y, width and height in input pixels.
+    """Our own network's output (1, 7, rows, columns), see `HEAT_CHANNELS`, as boxes and contacts in the
+    input's pixels, edges counted.
 
     A peak is a cell that none of its eight neighbours exceeds.
     """
@@ -91,10 +104,11 @@ def read_heat(output: NDArray[np.float32], threshold: float) -> Detections:
         axis=0,
     )
     i, j = np.nonzero((heat >= threshold) & (heat >= neighbours))
-    x, y, width, height = output[0, 1:, i, j].astype(np.float64).T
-    # The middle counts pixel middles; boxes count pixel edges.
+    x, y, width, height, floor_x, floor_y = output[0, 1:, i, j].astype(np.float64).T
+    # The network counts pixel middles.
     boxes = np.column_stack([x - width / 2, y - height / 2, x + width / 2, y + height / 2]) + 0.5
-    return _sorted(boxes, heat[i, j])
+    contacts = np.column_stack([floor_x, floor_y]) + 0.5
+    return _sorted(boxes, heat[i, j], contacts)
 
 
 def read_yolo(output: NDArray[np.float32], layout: Layout, number: int, threshold: float) -> Detections:
@@ -129,12 +143,12 @@ def suppress(found: Detections, overlap: float) -> Detections:
             if np.any((shared > overlap * union) | (inside > 0.8)):
                 continue
         kept.append(k)
-    return Detections(boxes[kept], found.scores[kept])
+    return found.only(kept)
 
 
-def _sorted(boxes: FloatArray, scores: FloatArray) -> Detections:
+def _sorted(boxes: FloatArray, scores: FloatArray, contacts: FloatArray | None = None) -> Detections:
     order = np.argsort(-scores, kind="stable")
-    return Detections(boxes.reshape(-1, 4)[order], scores[order])
+    return Detections(boxes.reshape(-1, 4), scores, contacts).only(order)
 
 
 def _is_raw(places: FloatArray) -> bool:
