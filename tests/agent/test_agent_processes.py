@@ -88,7 +88,7 @@ def process(*command: str | Path) -> Iterator[subprocess.Popen[str]]:
         finally:
             running.send_signal(signal.SIGTERM)
             try:
-                running.wait(5.0)
+                running.wait(10.0)  # what systemd gives it
             except subprocess.TimeoutExpired:
                 running.kill()
                 raise
