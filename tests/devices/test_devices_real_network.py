@@ -66,9 +66,16 @@ class Observer:
             while True:
                 self.events.append((time.monotonic(), self._sock.recv(4096).decode()))
 
-    def heard_s(self, text: str) -> float | None:
-        """When the last event with this text came."""
-        return next((at_s for at_s, said in reversed(self.events) if text in said), None)
+    async def hears(self, text: str) -> float:
+        """When the last event with this text came; waits for one."""
+        found: list[float] = []
+
+        def heard() -> bool:
+            found[:] = [at_s for at_s, said in self.events if text in said]
+            return bool(found)
+
+        await until(heard, f"the observer hears {text}")
+        return found[-1]
 
     def close(self) -> None:
         asyncio.get_running_loop().remove_reader(self._sock)
@@ -166,14 +173,12 @@ async def test_who_joins_is_in_the_table_within_a_second(network: RealNetwork) -
                 mac = f"f4:f5:d8:00:01:{number:02x}"
                 await do(network.join, 0, mac)
                 await until(lambda mac=mac: there.here(mac) and there.kept(mac, 0.1), f"{mac} in the table")
-                heard_s = observer.heard_s(f"AP-STA-CONNECTED {mac}")
-                assert heard_s is not None
+                heard_s = await observer.hears(f"AP-STA-CONNECTED {mac}")
                 joining.append(there.changed_s[mac] - heard_s)
             tell("AP-STA-CONNECTED until in the table and in the store", joining)
             await do(network.logoff, 0)
             await until(lambda: not there.here(mac), "gone")
-            left_s = observer.heard_s(f"AP-STA-DISCONNECTED {mac}")
-            assert left_s is not None
+            left_s = await observer.hears(f"AP-STA-DISCONNECTED {mac}")
             await until(lambda: there.kept(mac, left_s - SOON_S), "kept")
             tell("AP-STA-DISCONNECTED until gone", [there.changed_s[mac] - left_s])
         finally:

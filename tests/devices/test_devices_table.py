@@ -8,53 +8,15 @@ from dataclasses import replace
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+from table_world import Home
 
 from vad.devices.device import MAX_MACS, Change, Device, bounded
-from vad.devices.identity import GENERIC_NAMES, is_random, stable_client_id, telling_host_name
-from vad.devices.station import StationEvent
+from vad.devices.identity import GENERIC_NAMES, stable_client_id, telling_host_name
 from vad.devices.table import APART_NS, MAX_TOLD, DeviceTable
 
 LAMP, TV = "f4:f5:d8:00:00:01", "f4:f5:d8:00:00:02"
 PHONE, PHONE_LATER, PHONE_AT_LAST = "02:00:00:00:00:0a", "06:00:00:00:00:0b", "0a:00:00:00:00:0c"
 DUID = "ff:11:22:33:44:00:02:00:00:ab:11:01:02:03:04:05:06"
-HOUR_NS = 3600 * 10**9
-
-
-class Home:
-    """A table, and a clock that goes on by a second an event."""
-
-    def __init__(self, **arguments: object) -> None:
-        self.measured: set[str] = set()
-        self.table = DeviceTable(measured=self.measured.__contains__, **arguments)  # type: ignore[arg-type]
-        self.now_ns = 0
-
-    def _now(self) -> str:
-        return time.strftime("%Y-%m-%dT%H:%M:%S.000Z", time.gmtime(1.7e9 + self.now_ns // 10**9))
-
-    def _take(self, kind: str, mac: str, interface: str = "wlan0", **facts: str) -> list[Change]:
-        self.now_ns += 10**9
-        event = StationEvent(self.now_ns, kind, mac, interface, **facts)  # type: ignore[arg-type]
-        return self.table.take(event, self._now())
-
-    def join(self, mac: str, interface: str = "wlan0", **facts: str) -> list[Change]:
-        return self._take("joined", mac, interface, **facts)
-
-    def leave(self, mac: str, interface: str = "wlan0") -> list[Change]:
-        return self._take("left", mac, interface)
-
-    def tell(self, mac: str, **facts: str) -> list[Change]:
-        return self._take("told", mac, "dhcp", **facts)
-
-    def listed(self, mac: str, **facts: str) -> list[Change]:
-        return self._take("listed", mac, "settings", **facts)
-
-    def wait(self, nanoseconds: int) -> list[Change]:
-        self.now_ns += nanoseconds
-        return self.table.tick(self.now_ns, self._now())
-
-    def known(self) -> list[tuple[str, ...]]:
-        return [device.macs for device in self.table.all()]
 
 
 def test_who_joins_is_known_and_what_is_told_of_him_is_kept() -> None:
@@ -360,100 +322,3 @@ def test_identities_of_any_text(host_name: str, client_id: str) -> None:
     assert name is None or (len(name) >= 3 and name not in GENERIC_NAMES)
     stable = stable_client_id(client_id, PHONE)
     assert stable is None or PHONE not in stable
-
-
-MACS = (*(f"f4:f5:d8:00:00:0{k}" for k in range(3)), *(f"02:00:00:00:00:0{k}" for k in range(5)))
-macs = st.sampled_from(MACS)
-
-
-class TableStories(RuleBasedStateMachine):
-    """Any order of events: addresses have one owner, what is told rebuilds the table, nothing leaks."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.home = Home(limit=5, names={MACS[0]: "lamp"}, ignore=[MACS[1]])
-        self.mirror: dict[str, Device] = {}
-        self.inside: set[tuple[str, str]] = set()
-
-    def keep(self, changes: list[Change]) -> None:
-        for change in changes:
-            mac = change.device.mac
-            if change.kind == "gone":
-                del self.mirror[mac]
-                assert change.into is None or change.into in self.mirror
-            else:
-                assert (change.kind == "new") == (mac not in self.mirror)
-                self.mirror[mac] = change.device
-
-    @rule(mac=macs, interface=st.sampled_from(["wlan0", "wlan1"]))
-    def join(self, mac: str, interface: str) -> None:
-        self.keep(self.home.join(mac, interface))
-        if self.home.table.find(mac) is not None:
-            self.inside.add((mac, interface))
-
-    @rule(mac=macs, interface=st.sampled_from(["wlan0", "wlan1"]))
-    def leave(self, mac: str, interface: str) -> None:
-        self.keep(self.home.leave(mac, interface))
-        self.inside.discard((mac, interface))
-
-    @rule(
-        mac=macs,
-        name=st.sampled_from(["anna", "ben", "iphone"]),
-        ip=st.sampled_from(["10.0.0.1", "10.0.0.2"]),
-    )
-    def tell(self, mac: str, name: str, ip: str) -> None:
-        self.keep(self.home.tell(mac, host_name=name, ip=ip))
-
-    @rule(minutes=st.integers(0, 20))
-    def wait(self, minutes: int) -> None:
-        self.keep(self.home.wait(minutes * 60 * 10**9))
-
-    @precondition(lambda self: self.mirror)
-    @rule(data=st.data(), ignored=st.none() | st.booleans(), name=st.none() | st.sampled_from(["", "x", "y"]))
-    def change(self, data: st.DataObject, ignored: bool | None, name: str | None) -> None:
-        mac = data.draw(st.sampled_from(sorted(self.mirror)))
-        self.mirror[mac] = self.home.table.change(mac, ignored=ignored, name=name)
-
-    @precondition(lambda self: self.mirror)
-    @rule(data=st.data())
-    def measure(self, data: st.DataObject) -> None:
-        self.home.measured.add(data.draw(st.sampled_from(sorted(self.mirror))))
-
-    @precondition(lambda self: self.mirror)
-    @rule(data=st.data())
-    def forget(self, data: st.DataObject) -> None:
-        mac = data.draw(st.sampled_from(sorted(self.mirror)))
-        self.home.measured.discard(mac)
-        del self.mirror[self.home.table.forget(mac).mac]
-
-    @invariant()
-    def what_was_told_is_the_table(self) -> None:
-        assert {device.mac: device for device in self.home.table.all()} == self.mirror
-        assert len(self.mirror) <= 5
-
-    @invariant()
-    def addresses_have_one_owner(self) -> None:
-        owned = [mac for device in self.mirror.values() for mac in device.macs]
-        assert len(owned) == len(set(owned))
-        assert all(device.mac in device.macs for device in self.mirror.values())
-        ips = [device.ip for device in self.mirror.values() if device.ip is not None]
-        assert len(ips) == len(set(ips))
-        assert all(self.home.table.find(mac) is not None for mac in owned)
-
-    @invariant()
-    def who_is_in_is_known(self) -> None:
-        for device in self.mirror.values():
-            here = any((mac, wlan) in self.inside for mac in device.macs for wlan in ("wlan0", "wlan1"))
-            assert self.home.table.in_network(device) == here
-
-    @invariant()
-    def nothing_real_was_joined_with_something_real(self) -> None:
-        for device in self.mirror.values():
-            assert len([mac for mac in device.macs if not is_random(mac)]) <= 2
-
-    @invariant()
-    def the_measured_are_kept(self) -> None:
-        assert all(self.home.table.find(mac) is not None for mac in self.home.measured)
-
-
-TestTableStories = TableStories.TestCase
