@@ -2,11 +2,11 @@
 
 Compiled with numba (a tool's dependency, never the package's). Metres, radians, linear colour. Its tables:
 
-primitive: kind, x, y, z (of the base's middle; of a ball its centre), cos yaw, sin yaw, a, b, c, material of
+primitive: kind, x, y, z (of the base's middle; a ball's centre), cos yaw, sin yaw, a, b, c, material of
 the side, material of the top, object number. BOX: half length, half width, height; ROUND: radius below,
-radius above, height; BALL: the half axes. material: r, g, b, texture (-1: none), texture side in m, shininess,
+radius above, height; BALL: half axes. material: r, g, b, texture (-1: none), texture side in m, shininess,
 gloss, mirror, roughness, mapping (0 by place, 1 the cap's own square), two spare. overlay on the floor: shape
-(0 rectangle, 1 ellipse, 2 ring), x, y, cos, sin, half length, half width, ring's width, material. window: wall
+(0 rectangle, 1 ellipse, 2 ring), x, y, cos, sin, half length, half width, its width, material. window: wall
 (0..3), u0, u1, v0, v1 in m along the wall and above the floor, brightness, panes along u and v.
 """
 
