@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import socket
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
@@ -97,6 +98,21 @@ async def network(folder: Path, *issue: tuple[Role, str]) -> AsyncIterator[tuple
             await running
         for session in (*world.sessions, router):
             await asyncio.to_thread(session.close)
+
+
+def gate_pid() -> int:
+    """The gate's process below this one."""
+    own = os.getpid()
+    for task in Path(f"/proc/{own}/task").iterdir():
+        for child in (task / "children").read_text().split():
+            if b"gate_process" in Path(f"/proc/{child}/cmdline").read_bytes():
+                return int(child)
+    raise AssertionError("there is no gate")
+
+
+def memory_kib(pid: int) -> int:
+    """Memory in use by a process."""
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") // 1024
 
 
 def linked(session: zenoh.Session) -> bool:

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import zenoh
 from bus_world import ROOT, until
-from security_world import Network, answer, ask, free_port, network, on
+from security_world import Network, answer, ask, free_port, gate_pid, network, on
 
 from vad.bus.session import LEASE_MS, BusSettings, open_session
 from vad.errors import VadError
@@ -145,10 +145,7 @@ async def test_a_killed_gate_comes_back_by_itself(tmp_path: Path) -> None:
 
 def kill_gate() -> None:
     """As if it had run out of memory."""
-    pid = os.getpid()
-    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    (gate,) = (c for c in children if b"gate_process" in Path(f"/proc/{c}/cmdline").read_bytes())
-    os.kill(int(gate), signal.SIGKILL)
+    os.kill(gate_pid(), signal.SIGKILL)
 
 
 class Wire:

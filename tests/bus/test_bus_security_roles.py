@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 import zenoh
 from bus_world import until
-from security_world import Network, answer, ask, network, on
+from security_world import Network, answer, ask, gate_pid, memory_kib, network, on
 
+from vad.bus.gate import TOLD_EACH
 from vad.client import VadClient
 from vad.errors import VadError
 from vad.pki.certificates import Role
@@ -254,3 +255,30 @@ async def test_denied_attempts_are_counted_and_named(
         "Query on 'vad/**'",
     ]
     assert all(sentence.startswith("'agent.a1.") for sentence in said)
+
+
+@pytest.mark.slow
+async def test_a_flood_of_denied_attempts_is_counted_and_fills_nothing(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """50,000 puts on as many keys: all counted, a few told, and another client is answered meanwhile."""
+
+    def flood(world: Network, credentials: Path) -> None:
+        session = world.connect(credentials)
+        for i in range(50_000):
+            session.put(f"vad/home/devices/x{i}", b"x", congestion_control=zenoh.CongestionControl.BLOCK)
+
+    async with network(tmp_path, ("viewer", "bad"), ("viewer", "good")) as (world, (bad, good)):
+        answer(world.router, "vad/home/status", b"fine")
+        session = await asyncio.to_thread(world.connect, good)
+        await until(lambda: ask(session, "vad/home/status") == [b"fine"], "the way is open")
+        before_kib = memory_kib(gate_pid())
+        flooding = asyncio.create_task(asyncio.to_thread(flood, world, bad))
+        while not flooding.done():
+            begun = time.monotonic()
+            assert await asyncio.to_thread(ask, session, "vad/home/status") == [b"fine"]
+            assert time.monotonic() - begun < 2.0
+        await flooding
+        await until(lambda: world.gate.health.counters["denied"] == 50_000, "every one is counted", 30)
+        assert memory_kib(gate_pid()) - before_kib < 30_000
+    assert len([record for record in caplog.records if record.levelname == "WARNING"]) <= TOLD_EACH + 1

@@ -45,8 +45,8 @@ QUERY_BYTES = 4096
 MAX_SESSIONS = 64
 PENDING_SESSIONS = 32
 REPORT_BYTES = 256 * 1024
-TOLD = 1000
-"""Different denied attempts and refusals that are remembered as told."""
+TOLD_EACH, TOLD_NAMES = 10, 100
+"""Warnings of one client, and clients that are warned of; further attempts are counted, and shown with -v."""
 
 Fingerprint = tuple[tuple[int, int, int] | None, ...]
 
@@ -107,7 +107,7 @@ class Gate:
         self._renewal = ""
         self._renewed_at_s = -RENEW_EVERY_S
         self._refused = ""
-        self._told: set[str] = set()
+        self._told: dict[str, set[str]] = {}
 
     async def run(self) -> None:
         """Let clients in until cancelled; what is wrong is in `health`, never raised out of here."""
@@ -217,12 +217,13 @@ class Gate:
         counters = self.health.counters
         for attempt in report.denied:
             counters["denied"] += attempt.count
-            self._tell(f"{attempt.common_name!r} may not {attempt.what} on {attempt.key!r}")
+            name = attempt.common_name
+            self._tell(name, f"{name!r} may not {attempt.what} on {attempt.key!r}")
         counters["denied"] += report.denied_more
         for reason, count in report.refused.items():
             counters["refused"] += count
             self._refused = reason
-            self._tell(f"a connection was refused: {reason}")
+            self._tell("", f"a connection was refused: {reason}")
         for warning in report.warnings:
             _log.debug("zenoh: %r", warning)
         if report.connected is not None:
@@ -230,12 +231,17 @@ class Gate:
         if report.connected is not None or report.refused:
             self._say(detail)
 
-    def _tell(self, sentence: str) -> None:
-        """Warn of something once; how often it comes again is in the counters."""
-        level = logging.DEBUG if sentence in self._told else logging.WARNING
-        if len(self._told) < TOLD:
-            self._told.add(sentence)
-        _log.log(level, "%s", sentence)
+    def _tell(self, name: str, sentence: str) -> None:
+        """Warn of something once, and not of everything: who floods must not fill the log."""
+        if name not in self._told and len(self._told) >= TOLD_NAMES:
+            name = ""  # ids that change with each connection
+        told = self._told.setdefault(name, set())
+        new = sentence not in told and len(told) < TOLD_EACH
+        if new:
+            told.add(sentence)
+        _log.log(logging.WARNING if new else logging.DEBUG, "%s", sentence)
+        if new and len(told) == TOLD_EACH:
+            _log.warning("%s: further attempts are only counted", name or "others")
 
     def _say(self, detail: str) -> None:
         if self._connected:
