@@ -21,8 +21,8 @@ SEARCH_AGAIN_NS = 500_000_000
 _PIECE_FOR_ONE, _PIECE_FOR_FEW = (256, 192), (192, 128)
 _FOLLOW_AT_MOST = 3
 # Pieces looked at besides a whole picture that does not show all who are known.
-_SEARCH_PIECES = 2
-_CROWD_EVERY_NS = 100_000_000
+_SEARCH_PIECES = 1
+_CROWD_EVERY_NS = 120_000_000
 # Stamps jitter: what is due within this is done.
 _SLACK_NS = 10_000_000
 
