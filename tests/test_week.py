@@ -14,7 +14,8 @@ from vad.sim.household import DAY_S, hear, make_household
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 
-from bench_week import rows_of, simulate
+from bench_week import rows_of
+from bench_week_sim import simulate
 
 HOUSE = make_household(3)
 
