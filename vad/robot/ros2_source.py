@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+from collections import Counter
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Literal
@@ -18,7 +19,7 @@ from vad.robot.floor_plan import FloorPlan
 from vad.robot.pose import RobotPose, RobotStatus, status_now
 from vad.robot.ros2 import LATCHED, ROS_TYPES, Frames, Kind, Ros2Reader
 from vad.robot.ros2_keys import Style, key_expression, topic_name
-from vad.robot.zenoh_link import opened, subscribed
+from vad.robot.zenoh_link import opened, put_counted, subscribed
 from vad.streams import DropOldestQueue
 
 SILENCE_S = 2.0
@@ -110,7 +111,7 @@ class Ros2Source:
             for topic, kind in self._wanted:
                 for style in self._topics.styles:
                     key = key_expression(topic, ROS_TYPES[kind], style=style, domain=self._topics.domain)
-                    arrived = partial(_into, inbox, kind)
+                    arrived = partial(_into, inbox, self.health.counters, kind)
                     stack.enter_context(
                         subscribed(
                             session,
@@ -180,6 +181,10 @@ class Ros2Source:
 
 
 def _into(
-    inbox: DropOldestQueue[tuple[Kind, bytes, int]], kind: Kind, payload: bytes, arrival_ns: int
+    inbox: DropOldestQueue[tuple[Kind, bytes, int]],
+    counters: Counter[str],
+    kind: Kind,
+    payload: bytes,
+    arrival_ns: int,
 ) -> None:
-    inbox.put((kind, payload, arrival_ns))
+    put_counted(inbox, counters, (kind, payload, arrival_ns))

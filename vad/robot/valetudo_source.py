@@ -22,7 +22,7 @@ from vad.robot.floor_plan import FloorPlan
 from vad.robot.pose import RobotPose, RobotStatus, status_now
 from vad.robot.sse import MAX_HEAD_BYTES, ChunkedDecoder, SseParser, parse_head
 from vad.robot.valetudo import ValetudoMap, map_from_payload
-from vad.robot.zenoh_link import subscribed
+from vad.robot.zenoh_link import put_counted, subscribed
 from vad.streams import DropOldestQueue
 
 PATH = "/api/v2/robot/state/map/sse"
@@ -147,7 +147,7 @@ async def _from_zenoh(
     session: zenoh.Session, key: str, counters: Counter[str]
 ) -> AsyncGenerator[Payload, None]:
     inbox: DropOldestQueue[Payload] = DropOldestQueue(4)
-    arrived = functools.partial(_into, inbox)
+    arrived = functools.partial(_into, inbox, counters)
     with subscribed(session, key, arrived, intake=_INTAKE, counters=counters, latched=True):
         while True:
             try:
@@ -215,8 +215,8 @@ def _request(url: SplitResult) -> bytes:
     return "\r\n".join([*lines, "", ""]).encode()
 
 
-def _into(inbox: DropOldestQueue[Payload], payload: bytes, arrival_ns: int) -> None:
-    inbox.put((payload, arrival_ns))
+def _into(inbox: DropOldestQueue[Payload], counters: Counter[str], payload: bytes, arrival_ns: int) -> None:
+    put_counted(inbox, counters, (payload, arrival_ns))
 
 
 def _reason(error: Exception, where: str) -> str:

@@ -7,17 +7,20 @@ import contextlib
 import json
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator
-from typing import Any
+from typing import Any, TypeVar
 
 import zenoh
 import zenoh.ext
 
 from vad.handover import Handover, Intake
+from vad.streams import DropOldestQueue
 
 RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}
 """When the session knocks again after the robot's router went away."""
 OPEN_JOIN_S = 0.9
 _HISTORY = 1
+
+T = TypeVar("T")
 
 Arrived = Callable[[bytes, int], None]
 
@@ -61,6 +64,13 @@ async def opened(link: zenoh.Session | str) -> AsyncIterator[zenoh.Session]:
         yield session
     finally:
         await _close(session)
+
+
+def put_counted(inbox: DropOldestQueue[T], counters: Counter[str], item: T) -> None:
+    """Put, and count what had to go for it."""
+    before = inbox.dropped
+    inbox.put(item)
+    counters["overrun"] += inbox.dropped - before
 
 
 async def _close(session: zenoh.Session) -> None:

@@ -12,7 +12,7 @@ from vad.handover import Intake
 from vad.health import Health
 from vad.robot.json_source import MAX_PAYLOAD_BYTES, NO_PLACE_REASONS, report_from_json
 from vad.robot.pose import RobotPose, RobotStatus, status_now
-from vad.robot.zenoh_link import subscribed
+from vad.robot.zenoh_link import put_counted, subscribed
 from vad.streams import DropOldestQueue
 
 SILENCE_S = 2.0
@@ -58,7 +58,7 @@ class ZenohPoseSource:
         inbox: DropOldestQueue[tuple[bytes, int]] = DropOldestQueue(_INBOX)
 
         def arrived(payload: bytes, arrival_ns: int) -> None:
-            inbox.put((payload, arrival_ns))
+            put_counted(inbox, self.health.counters, (payload, arrival_ns))
 
         with subscribed(
             self._session, self._key_expr, arrived, intake=_INTAKE, counters=self.health.counters
