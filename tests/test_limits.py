@@ -1,4 +1,4 @@
-"""Size, depth and rate: what is over the limit is refused, what is not is not, for any message."""
+"""Depth and rate: what is over the limit is refused, what is not is not, for any message."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vad.limits import MAX_DEPTH, LimitError, RateLimit, check_depth, check_size
+from vad.limits import MAX_DEPTH, LimitError, RateLimit, check_depth
 
 S = 1_000_000_000
 
@@ -51,12 +51,6 @@ def test_a_tower_of_brackets_is_refused() -> None:
     with pytest.raises(LimitError):
         check_depth(b"[" * (MAX_DEPTH + 1))
     check_depth(b'{"text": "' + b"[" * 1000 + b'"}')
-
-
-def test_size() -> None:
-    check_size(10, 10)
-    with pytest.raises(LimitError, match="11 bytes; at most 10"):
-        check_size(11, 10)
 
 
 @given(st.integers(1, 50), st.integers(1, 20), st.lists(st.integers(0, S), max_size=60))

@@ -1,4 +1,4 @@
-"""How much may come in at once: size, depth and rate of messages. Pure: the time is an argument."""
+"""How deep and how fast messages may be; their size is the hand-over's matter. Pure: time is an argument."""
 
 from __future__ import annotations
 
@@ -20,12 +20,6 @@ class LimitError(ProtocolError):
     """More than is taken."""
 
     code = "limit"
-
-
-def check_size(size: int, max_bytes: int) -> None:
-    """LimitError where a message of `size` bytes is longer than `max_bytes`."""
-    if size > max_bytes:
-        raise LimitError(f"a message of {size} bytes; at most {max_bytes} are read")
 
 
 def check_depth(json: bytes, max_depth: int = MAX_DEPTH) -> None:
