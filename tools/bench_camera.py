@@ -16,6 +16,7 @@ from functools import partial
 
 import numpy as np
 from bench_camera_cases import FRAME_HZ, VARIANTS, Score, Variant, drive_of, rendered, solve
+from bench_camera_moved import Noticed, room
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -85,6 +86,27 @@ def table_of(title: str, groups: dict[str, list[Score]]) -> Table:
     return table
 
 
+def _moved(seeds: int, jobs: int, *, as_json: bool) -> None:
+    """Whether and when a moved camera is noticed, over rooms."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    rows: list[Noticed] = []
+    with ProcessPoolExecutor(jobs) as pool, Progress(*columns, console=Console(stderr=True)) as progress:
+        for part in progress.track(pool.map(room, range(seeds)), total=seeds, description="rooms"):
+            rows += part
+    if as_json:
+        print(json.dumps([asdict(row) for row in rows], indent=1))
+        return
+    table = Table(title="counts as moved", title_justify="left", box=None)
+    for name in ("what happened", "seen by", "noticed", "after s, mean / worst"):
+        table.add_column(name, justify="left" if name in ("what happened", "seen by") else "right")
+    for event, by in dict.fromkeys((row.event, row.by) for row in rows):
+        these = [row.after_s for row in rows if (row.event, row.by) == (event, by)]
+        when = [after for after in these if after is not None]
+        told = f"{np.mean(when):.0f} / {max(when):.0f}" if when else "–"
+        table.add_row(event, by, f"{len(when)}/{len(these)}", told)
+    Console(width=120).print(table)
+
+
 def main() -> None:
     options = argparse.ArgumentParser(prog="tools/bench camera", description=__doc__)
     options.add_argument(
@@ -98,8 +120,12 @@ def main() -> None:
     )
     options.add_argument("--jobs", type=int, default=1, help="processes")
     options.add_argument("--json", action="store_true", help="every score as one document")
+    options.add_argument("--moved", action="store_true", help="instead: is a moved camera noticed")
     given = options.parse_args()
     os.nice(NICENESS)
+    if given.moved:
+        _moved(given.seeds, given.jobs, as_json=given.json)
+        return
     variants = tuple(VARIANTS[k] for k in given.variant or range(len(VARIANTS)))
     shapes = given.shape or list(DRIVE_SHAPES)
     cases = [(s, p, k) for s in given.source or ["geometric"] for p in shapes for k in range(given.seeds)]

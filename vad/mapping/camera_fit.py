@@ -8,7 +8,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vad.geometry import FloatArray, Intrinsics, Rigid, project, rotation_from_vector
+from vad.geometry import (
+    FloatArray,
+    Intrinsics,
+    Rigid,
+    apply_homography,
+    floor_homography,
+    project,
+    rotation_from_vector,
+    undistort,
+)
 from vad.mapping.camera_calibration import PARAMETERS, moved
 from vad.mapping.camera_consensus import Sightings
 from vad.mapping.camera_track import PoseTrack
@@ -47,11 +56,12 @@ class Start:
 @dataclass(frozen=True, slots=True)
 class Fit:
     """The least-squares estimate. covariance: (12, 12); left_out_px: (N, 2) residuals of each pair when it is
-    predicted without itself."""
+    predicted without itself; rival_m: how far off on the floor another camera is that fits alike."""
 
     at: Start
     covariance: FloatArray
     left_out_px: FloatArray
+    rival_m: float = 0.0
 
 
 def starting_pose(
@@ -158,6 +168,17 @@ def refine(start: Start, sightings: Sightings, track: PoseTrack, *, free: NDArra
     jacobian = _jacobian(at, sightings, track, whiten)
     normal, _ = _normal_equations(jacobian, error, at, free)
     return _conclude(at, sightings, track, whiten, jacobian, error, normal, free)
+
+
+def apart_m(one: Start, other: Start, image_px: FloatArray) -> float:
+    """Mean distance of two cameras' floor points of the same raw pixels (N, 2)."""
+    here, there = (
+        apply_homography(
+            floor_homography(at.intrinsics, at.camera_from_map), undistort(image_px, at.intrinsics)
+        )
+        for at in (one, other)
+    )
+    return float(np.nanmean(np.linalg.norm(here - there, axis=1)))
 
 
 def information(at: Start, sightings: Sightings, track: PoseTrack, *, lens_known: bool) -> FloatArray:

@@ -8,7 +8,7 @@ candidates and poses names the robot, finds the time offset and calibrates the c
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -27,6 +27,7 @@ from vad.mapping.camera_fit import (
     OFFSET,
     Fit,
     Start,
+    apart_m,
     free_parameters,
     predict,
     refine,
@@ -41,6 +42,8 @@ MIN_AREA_M2 = 0.5
 MIN_WIDTH_M = 0.12
 MAX_POSITION_SIGMA_M = 0.3
 MAX_DEVIATION_M = 0.12
+# Two solutions this near to each other are one.
+MAX_RIVAL_M = 0.1
 # The robot must be what moves where it says it is in this share of the frames that should show it moving.
 MIN_AGREEING = 0.4
 # So many frames with something moving, and none of it the robot, are a verdict and not a lack of data.
@@ -56,6 +59,8 @@ _MAX_SURPRISE = 4.0
 # A stretch of the drive after the robot found itself anew joins the rest where so many frames agree.
 _JOIN_SHARE = 0.5
 _ENOUGH_SIGHTINGS = 100
+# Squared surprise by which one solution must be better than another to be told from it.
+_RIVAL_MARGIN = 40.0
 # The pose must be known this long around a pair, for its derivative in time.
 _TIME_MARGIN_S = 0.25
 _MOVING_M_S = 0.05
@@ -201,17 +206,20 @@ class CameraMapper:
             return None
         straight = undistort(sightings.image_px, self._lens)
         few = sightings.frame < np.unique(sightings.frame)[:_SEARCH_FRAMES][-1]
-        best: tuple[float, Fit, Sightings] | None = None
+        solved: list[tuple[float, Fit, Sightings]] = []
         for guess in search_time_offset(straight[few], sightings.take(few), track):
             found = consensus(straight, sightings, track, guess.time_offset_s)
             if found is None or found.frames < 6:
                 continue
             fitted = self._fit_from(found, straight, sightings, track)
             if fitted is not None:
-                cost = self._misfit(fitted[0].at, sightings, track)
-                if best is None or cost < best[0]:
-                    best = cost, *fitted
-        return None if best is None else best[1:]
+                solved.append((self._misfit(fitted[0].at, sightings, track), *fitted))
+        if not solved:
+            return None
+        cost, fit, pairs = min(solved, key=lambda one: one[0])
+        alike = [other for misfit, other, _ in solved if misfit < cost + _RIVAL_MARGIN]
+        apart = [apart_m(fit.at, other.at, pairs.image_px) for other in alike]
+        return replace(fit, rival_m=max(apart)), pairs
 
     def _misfit(self, at: Start, sightings: Sightings, track: PoseTrack) -> float:
         """How badly a camera explains all frames: squared surprise of the best of each, cut off."""
@@ -321,6 +329,12 @@ class CameraMapper:
         if (refused_spread := _spread_gate(*spread(xy_m))) is not None:
             percent, reason = refused_spread
             return "collecting", percent, reason + self._advice(pairs)
+        if fit.rival_m > MAX_RIVAL_M:
+            return (
+                "collecting",
+                90,
+                "the drive fits several places of the camera: let the robot drive straight, too",
+            )
         if not deviation_m <= MAX_DEVIATION_M:
             return "invalid", 99, f"robot and camera differ by {deviation_m:.2f} m on average"
         sigma_m = float(np.sqrt(np.linalg.eigvalsh(fit.covariance[3:6, 3:6])[-1]))
