@@ -58,7 +58,9 @@ def pictures(kind: str, count: int = 14, whole: bool = False) -> tuple[Image, ..
     return tuple(drawn)
 
 
-@pytest.mark.parametrize(("kind", "whole"), [("charuco", False), ("chess", True)])
+@pytest.mark.parametrize(
+    ("kind", "whole"), [("charuco", False), pytest.param("chess", True, marks=pytest.mark.slow)]
+)
 def test_the_lens_is_found_again(kind: str, whole: bool) -> None:
     measurement = LensMeasurement(Board("charuco" if kind == "charuco" else "chess"))
     for picture in pictures(kind, 18 if whole else 14, whole):
@@ -98,6 +100,7 @@ def test_what_is_missing_is_said() -> None:
         measurement.add(first[:240])
 
 
+@pytest.mark.slow
 def test_a_bent_board_is_refused() -> None:
     measurement = LensMeasurement(Board())
     for k, picture in enumerate(pictures("charuco")):

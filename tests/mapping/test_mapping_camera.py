@@ -121,10 +121,10 @@ def true_deviation(scene: Scene, result: CameraCalibration) -> float:
     ("shape", "limit_m"), [("L", 0.03), ("circle", 0.03), ("rectangle", 0.03), ("random", 0.05)]
 )
 def test_drive_calibrates_an_unknown_camera(shape: str, limit_m: float) -> None:
-    scenes = [simulate(shape, seed) for seed in range(4)]
+    scenes = [simulate(shape, seed) for seed in range(2)]
     results = [scene.mapper.solve() for scene in scenes]
-    assert [r.status for r in results] == ["valid"] * 4
-    assert [(r.percent, r.reason) for r in results] == [(100, "")] * 4
+    assert [r.status for r in results] == ["valid"] * 2
+    assert [(r.percent, r.reason) for r in results] == [(100, "")] * 2
     deviations = [true_deviation(s, r) for s, r in zip(scenes, results, strict=True)]
     assert np.mean(deviations) <= limit_m
     # Stated with the poses' own 2 cm per axis in it.
@@ -136,6 +136,7 @@ def test_drive_calibrates_an_unknown_camera(shape: str, limit_m: float) -> None:
     assert np.mean(offset) <= 0.03
 
 
+@pytest.mark.slow
 def test_stated_covariance_of_the_position_is_true() -> None:
     squared = []
     for seed in range(8):
@@ -146,6 +147,7 @@ def test_stated_covariance_of_the_position_is_true() -> None:
     assert 0.4 < np.mean(squared) < 2.5
 
 
+@pytest.mark.slow
 def test_clutter_in_every_picture_does_not_hide_the_robot() -> None:
     scene = simulate("random", 1, laps=2, spurious=4)
     result = scene.mapper.solve()
@@ -154,6 +156,7 @@ def test_clutter_in_every_picture_does_not_hide_the_robot() -> None:
     assert abs(result.time_offset_s - scene.latency_s) <= 0.03
 
 
+@pytest.mark.slow
 def test_known_lens_gives_the_position_within_5_cm() -> None:
     errors = []
     for seed in range(5):

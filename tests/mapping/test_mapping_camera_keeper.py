@@ -137,7 +137,7 @@ def looks(keeper: CameraKeeper, pictures: list[Image], begin_s: float) -> int:
     return 0
 
 
-@pytest.mark.parametrize("turn_m", [0.15, 1.0])
+@pytest.mark.parametrize("turn_m", [0.15, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_the_background_says_that_the_camera_was_moved(turn_m: float) -> None:
     before, after = renderer(), renderer(turn_m)
     keeper = CameraKeeper(640, 480, None, calibrated(CameraView.of(before.frame(1.0))))
@@ -148,6 +148,7 @@ def test_the_background_says_that_the_camera_was_moved(turn_m: float) -> None:
     assert "moved" in keeper.calibration.reason
 
 
+@pytest.mark.slow
 def test_a_camera_turned_to_another_wall_is_noticed() -> None:
     before = renderer().frame(1.0)
     other = make_drive(5, "rectangle", laps=1)
@@ -181,7 +182,13 @@ def lit(picture: Image, kind: str) -> Image:
     return np.asarray(np.clip(light, 0.0, 255.0), dtype=np.uint8)
 
 
-@pytest.mark.parametrize("kind", ["dim", "dark", "bright", "lamp", "sun", "infrared"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "dark",
+        *(pytest.param(k, marks=pytest.mark.slow) for k in ("dim", "bright", "lamp", "sun", "infrared")),
+    ],
+)
 def test_light_alone_never_moves_the_camera(kind: str) -> None:
     keeper = CameraKeeper(640, 480, None, calibrated(CameraView.of(renderer().frame(1.0))))
     pictures = [lit(renderer().frame(5.0 + 5.0 * k), kind) for k in range(8)]

@@ -1,0 +1,119 @@
+"""`vad camera`: tables and overlay from a simulated drive; the whole command on a simulated home is slow."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+from vad.commands.app import app
+from vad.commands.camera_tables import check_json, check_table, progress_table, result_json, rows_of
+from vad.mapping.camera_calibration import CameraCalibration
+from vad.mapping.camera_stage import CameraMapper, Deviations
+from vad.report.camera_overlay import draw_overlay
+from vad.sim.camera_drive import POSE_SIGMA_M, Drive, make_drive
+
+S_NS = 1_000_000_000
+
+
+@pytest.fixture(scope="module")
+def result() -> tuple[Drive, CameraCalibration, Deviations]:
+    drive = make_drive(1, "L", laps=1)
+    mapper = CameraMapper(640, 480)
+    rng = np.random.default_rng(0)
+    for t, (x, y) in zip(*drive.poses(rng, rate_hz=10.0), strict=True):
+        mapper.add_pose(round(t * S_NS), x, y, POSE_SIGMA_M)
+    for frame in drive.candidates(rng, rate_hz=10.0):
+        mapper.add_candidates(round(frame.t_s * S_NS), frame.px, frame.sigma_px)
+    found = mapper.solve()
+    assert found.status == "valid"
+    against = mapper.deviations(found)
+    assert against is not None
+    return drive, found, against
+
+
+def shown(table: object) -> str:
+    console = Console(width=120)
+    with console.capture() as captured:
+        console.print(table)
+    return captured.get()
+
+
+def test_deviations_by_part_of_the_picture(result: tuple[Drive, CameraCalibration, Deviations]) -> None:
+    _, found, against = result
+    rows = rows_of(against, found)
+    assert rows[0].part == "all"
+    assert rows[0].pairs == len(against.robot_m)
+    assert sum(row.pairs for row in rows if "third" in row.part) == rows[0].pairs
+    assert 0.0 < rows[0].median_m <= rows[0].mean_m <= rows[0].p95_m <= rows[0].worst_m
+    assert rows[0].mean_m < 0.06
+    assert against.agreeing > 0.7
+    assert f"{100 * rows[0].mean_m:.1f}" in shown(check_table(rows))
+    plain = json.loads(json.dumps(check_json(rows, against.agreeing, right=True)))
+    assert plain["right"] is True
+    assert plain["parts"][0]["mean_m"] == rows[0].mean_m
+    moved = Deviations(
+        against.robot_m,
+        np.add(against.camera_m, (0.3, 0.0)),
+        against.image_px,
+        against.agreeing,
+        against.path_m,
+    )
+    assert rows_of(moved, found)[0].bias_x_m == pytest.approx(rows[0].bias_x_m + 0.3, abs=1e-3)
+
+
+def test_progress_says_every_estimate_and_what_is_missing(
+    result: tuple[Drive, CameraCalibration, Deviations],
+) -> None:
+    _, found, against = result
+    text = shown(progress_table(found, "camera: no pictures", against))
+    for word in ("valid", "100 %", "focal length", "±", "ms", "this drive", "no pictures"):
+        assert word in text
+    text = shown(
+        progress_table(CameraCalibration("collecting", 40, "drive across", unseen=("left",), pairs=9))
+    )
+    assert "drive across" in text
+    assert "left" in text
+    plain = json.loads(json.dumps(result_json(found)))
+    assert "view" not in plain
+    assert len(plain["position_m"]) == 3
+
+
+def test_overlay_draws_the_floor_where_it_is(result: tuple[Drive, CameraCalibration, Deviations]) -> None:
+    drive, found, against = result
+    blank = np.full((480, 640, 3), 90, dtype=np.uint8)
+    walls = drive.robot_xy_m(np.array([10.0]))
+    drawn = draw_overlay(blank, found, walls_m=walls)
+    place = drive.pixels(walls)[0]
+    around = drawn[int(place[1]) - 6 : int(place[1]) + 7, int(place[0]) - 6 : int(place[0]) + 7].astype(int)
+    assert np.any((around[..., 2] > 180) & (around[..., 1] < 120)), (
+        "the wall's dot is where the camera sees it"
+    )
+    assert not np.array_equal(drawn, blank)
+    everything = draw_overlay(
+        blank,
+        found,
+        walls_m=walls,
+        path_m=against.path_m,
+        found_px=against.image_px,
+        robot_m=against.robot_m,
+        errors=True,
+        lines=["±3 cm"],
+    )
+    assert everything.shape == blank.shape
+    assert np.all(blank == 90), "the picture given is left as it was"
+    with pytest.raises(ValueError, match="not calibrated"):
+        draw_overlay(blank, CameraCalibration("collecting", 0, ""))
+
+
+def test_wrong_use_is_told_in_one_line(tmp_path: Path) -> None:
+    run = CliRunner()
+    for command in ("calibrate", "check"):
+        done = run.invoke(app, ["camera", command, "--config", str(tmp_path / "none.yaml")])
+        assert done.exit_code == 2
+        assert "none.yaml" in done.output
+        assert "Traceback" not in done.output
