@@ -91,9 +91,9 @@ async def hearing(session: zenoh.Session) -> AsyncIterator[Agents]:
             await task
 
 
-async def there(agents: Agents, mac: str = MAC) -> RemoteCard:
+async def there(agents: Agents, mac: str = MAC, timeout_s: float = 15.0) -> RemoteCard:
     """The agent's card, once the hub has heard of it."""
-    await until(lambda: agents.card_of(mac) is not None, f"an agent with the card {mac}")
+    await until(lambda: agents.card_of(mac) is not None, f"an agent with the card {mac}", timeout_s)
     card = agents.card_of(mac)
     assert card is not None
     return card
