@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """The bus over loopback: 500 devices asked for while the solver works, many clients, memory.
 
-tools/bench bus [--devices 500] [--queries 100000] [--clients 50] [--seed 1] [--json]
+tools/bench bus [--alone] [--devices 500] [--queries 100000] [--clients 50] [--seed 1] [--json]
 
 A process of its own plays the daemon: the bus, the store, a status twice a second, a device that changes five
 times a second, and the daemon's solver at work without a pause. Exit code 1 where a limit is not kept.
@@ -181,6 +181,9 @@ def main(
     queries: Annotated[int, typer.Option(help="Over which memory is watched; 0 leaves it out.")] = 100_000,
     clients: Annotated[int, typer.Option(help="That ask 10,000 questions at once; 0 leaves it out.")] = 50,
     solve: Annotated[bool, typer.Option(help="Keep the solver at work.")] = True,
+    alone: Annotated[
+        bool, typer.Option("--alone", help="Leave other programs out: real-time priority (root).")
+    ] = False,
     seed: Annotated[int, typer.Option(help="Of which devices are asked for.")] = 1,
     as_json: Annotated[bool, typer.Option("--json", help="JSON instead of tables.")] = False,
 ) -> None:
@@ -190,6 +193,8 @@ def main(
         folder = Path(name)
         session = record_walk(folder / "walk", make_home(1)) if solve else None
         with Hub(folder, devices, session) as hub:
+            if alone:
+                hub.before_all_others()
             rows = latencies(hub, rounds, seed)
             if clients:
                 rows.append(crowd(hub, clients, 10_000))

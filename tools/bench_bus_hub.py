@@ -150,6 +150,18 @@ class Hub:
             self._process.kill()
         self._process.wait()
 
+    def before_all_others(self) -> None:
+        """Give the hub's threads and ours the processor whenever they want it, as on a machine of their own.
+
+        The solver comes after them, and before the rest of the machine. Needs root.
+        """
+        children = Path(f"/proc/{self._process.pid}/task/{self._process.pid}/children").read_text()
+        for child in children.split():
+            os.setpriority(os.PRIO_PROCESS, int(child), -15)
+        for pid in (self._process.pid, os.getpid()):
+            for task in Path(f"/proc/{pid}/task").iterdir():
+                os.sched_setscheduler(int(task.name), os.SCHED_RR, os.sched_param(1))
+
     def rss_mb(self) -> float:
         """Resident memory of the hub, without its solver."""
         pages = int(Path(f"/proc/{self._process.pid}/statm").read_text().split()[1])

@@ -36,6 +36,7 @@ from vad.store.store import Store
 from vad.store.worker import StoreWorker
 
 MACS = 60
+MUTE_S = 20.0
 LONGEST_S = 0.4
 """A writer lives at most this long after its first word."""
 START_LIMIT_S = 3.0
@@ -89,6 +90,8 @@ def live_and_die(path: Path, number: int, rng: random.Random, tally: Tally, know
         [sys.executable, __file__, "--write", str(path), str(number)], stdout=subprocess.PIPE, text=True
     )
     assert writer.stdout is not None
+    mute = threading.Timer(MUTE_S, writer.kill)  # one that never says anything is killed, too
+    mute.start()
     first = writer.stdout.readline()
     timer = threading.Timer(rng.uniform(0.0, LONGEST_S), writer.kill)
     timer.start()
@@ -103,6 +106,7 @@ def live_and_die(path: Path, number: int, rng: random.Random, tally: Tally, know
         refused = int(waits)
         tally.said += 1
     timer.cancel()
+    mute.cancel()
     writer.kill()
     writer.wait()
     tally.kills += 1
@@ -185,7 +189,7 @@ def main(
 ) -> None:
     """Kill and look; exit code 1 where something that was said is not kept."""
     if fill and folder is None:
-        raise typer.BadParameter("it needs --folder on a small file system, e.g. a tmpfs of 8 MB")
+        raise typer.BadParameter("it needs --folder on a small file system, e.g. a tmpfs of 48 MB")
     with tempfile.TemporaryDirectory() as temporary:
         tally = torture(folder or Path(temporary), kills, seed, fill)
     slowest_s = max(tally.start_s)
