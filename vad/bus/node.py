@@ -67,6 +67,7 @@ class Bus:
         self._answerers = answerers(self._board, source)
         self._past: Past | None = None
         self._later: set[asyncio.Task[None]] = set()
+        self._asked_past = 0
         for name, text in json_schemas().items():
             self._board.put(
                 self.keys.schema(), raw_entry(self.keys.schema(name), text.encode(), SCHEMA_ENCODING)
@@ -243,23 +244,26 @@ class Bus:
         self._to_loop(partial(self._note, outcome, begun_s))
 
     def _begin_later(self, answer: Later, query: zenoh.Query, begun_s: float) -> None:
-        task = asyncio.create_task(self._answer_later(answer, query, begun_s), name="bus: the past")
+        admitted = self._asked_past < MAX_LATER
+        self._asked_past += admitted
+        task = asyncio.create_task(self._answer_later(answer, query, begun_s, admitted), name="bus: the past")
         self._later.add(task)
         task.add_done_callback(self._later.discard)
 
-    async def _answer_later(self, answer: Later, query: zenoh.Query, begun_s: float) -> None:
+    async def _answer_later(self, answer: Later, query: zenoh.Query, begun_s: float, admitted: bool) -> None:
         """Ask the store, then send in a thread: an asker that does not read must not stop the loop."""
         outcome = ""
         try:
             if self._past is None:
                 raise NoHistoryError("this daemon keeps no history")
-            if len(self._later) > MAX_LATER:
+            if not admitted:
                 raise BusyError("too many questions about the past at once", remedy="Ask again in a second")
             replies = await answer.ask(self._past)
             outcome = await asyncio.to_thread(self._send, query, replies)
         except VadError as error:
             outcome = await asyncio.to_thread(self._refuse, query, error)
         finally:
+            self._asked_past -= admitted
             query.drop()  # type: ignore[no-untyped-call]
             self._note(outcome, begun_s)
 
