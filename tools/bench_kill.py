@@ -107,6 +107,7 @@ def live_and_die(path: Path, number: int, rng: random.Random, tally: Tally, know
     timer.cancel()
     mute.cancel()
     writer.kill()
+    writer.stdout.close()
     writer.wait()
     tally.kills += 1
     return highest + 10

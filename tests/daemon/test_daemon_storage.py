@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
-import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -21,7 +21,8 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(180)]
 
 HOME = make_home(1)
 WALK_START_S = HOME.walks[0].start_s
-START_S = 3.0
+START_CPU_S = 5.0
+"""2.6 s were measured, 2.4 s by the clock on an idle machine; twice that is another kind of start."""
 DEVICES = 500
 
 
@@ -73,22 +74,26 @@ def fill(folder: Path) -> Path:
             return ballast
 
 
-def test_500_devices_are_there_within_three_seconds(tmp_path: Path) -> None:
+def cpu_s(vad: Vad) -> float:
+    """What the daemon's process has had of the processor: the wall's clock would tell of other programs."""
+    fields = Path(f"/proc/{vad._process.pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def test_500_devices_are_there_soon(tmp_path: Path) -> None:
+    """Counted from the first line of Python on, after kill -9."""
     with home(tmp_path) as (settings, port):
         known_devices(settings.parent / "state")
         for end in (signal.SIGKILL, signal.SIGTERM):
             with Vad("run", "--config", settings, log=tmp_path / f"{end.name}.log") as vad:
-                # From then on: how long a busy machine takes to load Python says nothing of the store.
-                wait_for((settings.parent / "state" / "vad.sqlite-wal").exists, "the store is opened")
-                begun_s = time.monotonic()
                 with closing(connect(vad, port)) as client:
                     wait_for(lambda: len(client.devices()) >= DEVICES, "all devices")
-                    took_s = time.monotonic() - begun_s
+                    took_s = cpu_s(vad)
                 if end == signal.SIGTERM:
                     vad.end(end)
                 else:
                     vad.send(end)
-        assert took_s < START_S, "the start after kill -9"
+        assert took_s < START_CPU_S
 
 
 def test_kill_9_amid_a_capture_is_told_and_loses_nothing_else(tmp_path: Path) -> None:

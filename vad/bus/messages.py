@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import zlib
+from functools import cache
 from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
@@ -323,6 +324,7 @@ ALL: tuple[type[msgspec.Struct], ...] = (
 M = TypeVar("M", bound=msgspec.Struct)
 
 
+@cache
 def schema_id(kind: type[msgspec.Struct]) -> str:
     """The schema id of a message type, e.g. `vad.device.v1`."""
     for field in msgspec.structs.fields(kind):
