@@ -28,6 +28,7 @@ PACKAGED = BACKBONE.with_name("robot.onnx")
 INPUT = (288, 384)
 STRIDE = 8
 _KEPT = 1024
+_AVERAGE = 0.985  # what is kept is the mean of the last steps' weights
 WITHOUT_ROBOT = 3  # every third room
 
 
@@ -218,7 +219,11 @@ def train(arguments: argparse.Namespace) -> None:
     head = Head()
     if arguments.start is not None:
         head.load_state_dict(torch.load(arguments.start))
+    head = head.to(memory_format=torch.channels_last)  # half as much time on a CPU
     head.train()
+    average = torch.optim.swa_utils.AveragedModel(
+        head, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(_AVERAGE), use_buffers=True
+    )
     optimiser = torch.optim.AdamW(head.parameters(), lr=arguments.rate, weight_decay=1e-3)
     steps = int(arguments.epochs * len(rooms) / max(1, arguments.batch // arguments.reuse))
     schedule = torch.optim.lr_scheduler.OneCycleLR(
@@ -248,7 +253,12 @@ def train(arguments: argparse.Namespace) -> None:
             for k, stride in enumerate(TAPS)
         }
         wanted = [want for _, want in batch]
-        heat, box = head({stride: torch.from_numpy(tap) for stride, tap in taps.items()})
+        heat, box = head(
+            {
+                k: torch.from_numpy(tap).contiguous(memory_format=torch.channels_last)
+                for k, tap in taps.items()
+            }
+        )
         true, place, counts = (torch.from_numpy(np.stack(part)) for part in zip(*wanted, strict=True))
         logit = heat[:, 0]
         p = logit.sigmoid()
@@ -263,6 +273,7 @@ def train(arguments: argparse.Namespace) -> None:
         torch.nn.utils.clip_grad_norm_(head.parameters(), 5.0)
         optimiser.step()
         schedule.step()
+        average.update_parameters(head)
         mean += (loss_heat.item(), loss_box.item())
         if step % 50 == 0 or step == steps:
             done = (time.monotonic() - start) / step
@@ -270,7 +281,7 @@ def train(arguments: argparse.Namespace) -> None:
                 f"{step}/{steps} heat {mean[0] / 50:.3f} box {mean[1] / 50:.3f} {done:.2f} s each", flush=True
             )
             mean[:] = 0
-            torch.save(head.state_dict(), arguments.out)
+            torch.save(average.module.state_dict(), arguments.out)
 
 
 def export(arguments: argparse.Namespace) -> None:

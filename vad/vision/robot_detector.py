@@ -21,17 +21,19 @@ from vad.vision.robot import MAX_CANDIDATES, RobotCandidate, disc_contact, touch
 from vad.vision.robot_outputs import Detections, Layout, Letterbox, layout_of, read_heat, read_yolo, suppress
 
 PACKAGED_MODEL = Path(__file__).parent / "models" / "robot.onnx"
-PACKAGED_THRESHOLD = 0.3
+PACKAGED_THRESHOLD = 0.6
 """Working threshold of the packaged network; how it was chosen and what it costs: models/MODELS.md."""
 YOLO_THRESHOLD = 0.25
+CANDIDATE_SHARE = 0.4
+"""Candidates need this share of the threshold: which of them is the robot, its own poses say."""
 
 _PACKAGED_WIDTH = 384
 _PACKAGED_MULTIPLE = 16
 _OVERLAP = 0.5
-# Spread of the contact point, per width of the box: detectors' boxes are less exact than a blob's outline.
+# Spread of the contact point, per width of the box: seen in rendered rooms and in the simulated home.
 _EDGE_PX = 1.0
 _SIGMA_PX = 1.0
-_SIGMA_PER_WIDTH = 0.06
+_SIGMA_PER_WIDTH = 0.09
 _WHERE = "vision.robot_detector"
 
 FloatArray = NDArray[np.float64]
@@ -45,7 +47,7 @@ class RobotDetector:
         model_path: an ONNX file; None takes the packaged network.
         class_name: the robot's class in a YOLO model of several, a name in the model's own list or a number;
             None is fine for a model with one class.
-        threshold: least score of a candidate; None takes the usual one.
+        threshold: score from which on `detect`'s caller may say "here is a robot"; None takes the usual one.
         threads: for the network.
 
     Raises:
@@ -96,7 +98,7 @@ class RobotDetector:
             image: (height, width, 3) uint8 BGR. people_boxes: (N, 4) x0, y0, x1, y1 in raw pixels.
         """
         people = np.asarray(people_boxes, dtype=np.float64).reshape(-1, 4)
-        found = self.detect(image, self.threshold)
+        found = self.detect(image, CANDIDATE_SHARE * self.threshold)
         candidates = []
         height, width = image.shape[:2]
         for k, (x0, y0, x1, y1) in enumerate(found.boxes.tolist()):
