@@ -74,9 +74,9 @@ def test_candidates_are_the_discs_contact_and_none_are_people(tmp_path: Path) ->
     assert (candidate.x_px, candidate.y_px) == disc_contact(*candidate.box)
     assert 1.0 < candidate.sigma_px < 0.15 * (candidate.box[2] - candidate.box[0])
     x0, y0, x1, y1 = candidate.box
-    assert detector.update(image, np.array([[x0 - 30.0, y0 - 200.0, x0 + 5.0, y1 + 100.0]])) == []
+    assert detector.update(image, np.array([[x0 - 30.0, y0 - 200.0, x1, y1 + 100.0]])) == []
     assert candidate in detector.update(image, np.array([[x1 + 60.0, y0 - 200.0, x1 + 100.0, y1]]))
-    cut = room(640, 480, (0.02, 0.6), 0.025)
+    cut = room(640, 480, (0.03, 0.6), 0.025)
     assert len(detector.detect(cut, 0.5).boxes)
     assert detector.update(cut, NOBODY) == []
 
