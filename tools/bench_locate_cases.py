@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from vad.capture.session import load_session
 from vad.mapping.bound import DopplerBound, TrackNoise, doppler_bound
 from vad.mapping.device_stage import Recording
+from vad.sim.home import floor_plan
 from vad.sim.paper_setups import WALKERS, Setup, paper_radio, paper_setup
 from vad.sim.radio import OTHER_MAC, Radio
 from vad.sim.radio_body import TORSO_HEIGHT
@@ -113,6 +114,7 @@ def home_cases(seed: int) -> Iterator[list[Case]]:
     scenario = make_home(seed, walks=HOME_WALKS)
     radio = Radio(scenario, seed=seed)
     noise = TrackNoise(WHITE_M, HOME_SLOW_M)
+    plan = floor_plan(scenario)
     where = "next room" if scenario.device_m[0] > scenario.room_m[2] else "same room"
     for number, walk in enumerate(scenario.walks):
         t_ns, csi = heard(radio, walk)
@@ -136,6 +138,7 @@ def home_cases(seed: int) -> Iterator[list[Case]]:
                 scenario.plan_m,
                 bound_of(scenario, walk, noise),
                 scenario.room_m[2],
+                plan,
             )
         ]
 

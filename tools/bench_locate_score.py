@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import reduce
 
 import numpy as np
@@ -19,9 +19,13 @@ from vad.mapping.device_stage import (
     place_from_posterior,
 )
 from vad.mapping.doppler_likelihood import DopplerModel
+from vad.mapping.doppler_line import LineModel
+from vad.mapping.doppler_search import OFFSETS_S
 from vad.mapping.evidence import Terms
 from vad.mapping.paper import THRESHOLD_OFFICE_M, THRESHOLD_OPEN_SPACE_M
 from vad.mapping.posterior import Bounds, Grid, Posterior
+from vad.robot.floor_plan import FloorPlan
+from vad.solve import on_plan
 
 FloatArray = NDArray[np.float64]
 
@@ -30,23 +34,25 @@ PAPER_GRID_STEP_M = 0.2
 CONFIDENT_SHARE = 0.9
 """A posterior that gives another room this much is confident of the wrong one."""
 
-ABLATIONS: dict[str, dict[str, object]] = {
+ABLATIONS: dict[str, dict[str, float]] = {
     "full": {},
-    "kappa = 1": {"kappas": (1.0,)},
-    "track taken as exact": {"deviation_per_sigma": 0.0, "min_deviation_m": 0.005},
-    "all at one height": {"device_above_torso_m": 0.0, "anchor_above_torso_m": 0.0},
-    "track not smoothed": {"smoothing_s": 0.05},
-    "frames taken as independent": {"temper": 1.0},
+    "kappa known": {"kappa": 1.0, "kappa_sd": 0.0},
+    "body taken as a point": {"surface_m": 0.0, "surface_sd_m": 0.0},
+    "heights taken as known": {"anchor_sd_m2": 0.0, "device_sd_m2": 0.0},
+    "track taken as exact": {"track_share": 0.0},
+    "track's errors as large as stated": {"track_share": 1.0},
+    "limbs and ghosts ignored": {"clutter_hz": 0.05},
     "without antenna phases": {},
+    "time offset taken as known": {"late_sd_s": 0.0},
 }
-"""What each leaves out: fields of DopplerModel; antennas are left out by saying that they are elsewhere."""
+"""What each leaves out: fields of LineModel; antennas are left out by saying that they are elsewhere."""
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
     """One walk to be solved and what is known of it.
 
-    tags: what it is pooled by; wall_x_m: where the next room begins, in homes.
+    tags: what it is pooled by; wall_x_m, plan: where the next room begins and the floor plan, in homes.
     """
 
     name: str
@@ -57,6 +63,7 @@ class Case:
     bounds_m: Bounds
     bound: DopplerBound | None = None
     wall_x_m: float | None = None
+    plan: FloorPlan | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,14 +90,18 @@ class Score:
 
 def solve(case: Case, ablation: str = "full") -> tuple[Score, Evidence]:
     """One walk alone, with the paper's method beside it."""
-    known = {f.name for f in fields(DopplerModel)}
-    changes = {k: v for k, v in ABLATIONS[ablation].items() if k in known}
+    model = DopplerModel(line=replace(LineModel(), **ABLATIONS[ablation]))
     recording = case.recording
     if ablation == "without antenna phases":
         recording = replace(recording, array_end="anchor")
     before = time.process_time()
     grid = Grid.over(case.bounds_m, GRID_STEP_M)
-    evidence = evidence_from_walk(recording, grid, model=replace(DopplerModel(), **changes))
+    evidence = evidence_from_walk(
+        recording,
+        grid,
+        model=model,
+        offsets_s=(0.0,) if ablation == "time offset taken as known" else OFFSETS_S,
+    )
     cpu_s = time.process_time() - before
     if evidence.posterior is None:
         return Score(case.name, case.tags, 1, evidence.status, cpu_s=cpu_s), evidence
@@ -121,6 +132,8 @@ def fuse(name: str, cases: Sequence[Case], evidence: Sequence[Evidence]) -> Scor
 
 def _score(name: str, cases: Sequence[Case], posterior: Posterior, status: str) -> Score:
     first = cases[0]
+    if first.plan is not None:
+        posterior = on_plan(posterior, first.plan)
     place = place_from_posterior(posterior)
     off_m = place.xy_m - first.truth_m
     middle = np.mean([c.recording.walk.xy_m.mean(axis=0) for c in cases], axis=0)

@@ -21,8 +21,10 @@ from vad.mapping.device_stage import (
     place_from_posterior,
 )
 from vad.mapping.evidence import Terms
-from vad.mapping.posterior import Bounds, Grid
+from vad.mapping.plan_prior import plan_log_prior
+from vad.mapping.posterior import Bounds, Grid, Posterior
 from vad.mapping.walk import WalkTrack
+from vad.robot.floor_plan import FREE, OCCUPIED, FloorPlan
 
 FloatArray = NDArray[np.float64]
 
@@ -30,6 +32,9 @@ GRID_STEP_M = 0.1
 PAPER_GRID_STEP_M = 0.2
 MAX_SPAN_S = 600.0
 """A capture takes half a minute; times that are further apart are broken, and would only fill the memory."""
+
+PLAN_STEP_M = 0.05
+"""Finer than a wall."""
 
 MARGIN_WITHOUT_MAP_M = 4.0
 """A session without map bounds: the device is looked for this far around the walk and the anchor."""
@@ -152,3 +157,12 @@ def fuse(solved: Sequence[Solved]) -> list[Fused]:
             )
         )
     return results
+
+
+def on_plan(posterior: Posterior, plan: FloorPlan) -> Posterior:
+    """The posterior of all walks with what the floor plan says of where devices are; to be used once."""
+    fine = Grid.over(posterior.grid.bounds_m, PLAN_STEP_M)
+    cells = plan.occupancy_at(fine.points_m).reshape(fine.rows, fine.columns)
+    free = (cells >= FREE) & (cells < OCCUPIED / 2)
+    prior = plan_log_prior(free, fine, posterior.grid)
+    return Posterior(posterior.grid, posterior.log_density + prior)

@@ -26,6 +26,7 @@ from vad.mapping.plan_match import IDENTITY, PlanTransform
 from vad.mapping.posterior import Grid, Posterior
 from vad.mapping.reanchor import moved_posterior
 from vad.robot.floor_plan import FloorPlan
+from vad.solve import on_plan
 from vad.store.records import DeviceRecord, Estimate, PosteriorRecord
 from vad.store.worker import StoreWorker
 
@@ -98,8 +99,8 @@ class Registry:
 
     async def joined(self, mac: str, host_name: str | None) -> None:
         """A station joined and told its name."""
-        now_ns = time.monotonic_ns()
-        await self.take([StationEvent(now_ns, "joined", normal_mac(mac), "", host_name=host_name)])
+        event = StationEvent(time.monotonic_ns(), "joined", normal_mac(mac), "", host_name=host_name)
+        await self.take([event])
 
     async def take(self, events: Sequence[StationEvent]) -> list[str]:
         """What join sources tell; the devices that are new or came back, by `mac`.
@@ -276,13 +277,17 @@ class Registry:
         """The room of a place of the present map."""
         return self._plan.room_at(x_m, y_m)
 
+    def _joint(self, total: Posterior, walks: int) -> Posterior:
+        """All walks and the floor plan together, from the product of `walks` walks."""
+        return on_plan(joint_posterior(total, walks), self._plan)
+
     async def would_be_mapped(self, mac: str, evidence: Posterior) -> bool:
         """Whether this much of a walk would make the device a mapped one."""
         known = self._devices[mac]
         before = await self._posterior_of(known, evidence.grid)
         total = evidence if before is None else before.fused(evidence)
         walks = 1 if before is None else known.walks + 1
-        place = place_from_posterior(joint_posterior(total, walks))
+        place = place_from_posterior(self._joint(total, walks))
         enough = place.status == "located" and place.radius90_m <= self._settings.capture.mapped_radius_m
         return enough and walks >= self._settings.capture.min_walks
 
@@ -298,9 +303,9 @@ class Registry:
         fresh = before is None
         total = evidence if before is None else before.fused(evidence)
         walks = 1 if fresh else known.walks + 1
-        place = place_from_posterior(joint_posterior(total, walks))
+        posterior = self._joint(total, walks)
+        place = place_from_posterior(posterior)
         was_mapped = not anew and known.state == "mapped"
-        posterior = joint_posterior(total, walks)
         state, reason = verdict(
             self._settings.capture, self._plan, place, walks, posterior, was_mapped=was_mapped
         )
@@ -381,7 +386,7 @@ class Registry:
         )
 
     def _publish_heatmap(self, stored: PosteriorRecord) -> None:
-        p = joint_posterior(posterior_of(stored), stored.walks).probability
+        p = self._joint(posterior_of(stored), stored.walks).probability
         self._bus.publish_heatmap(
             m.heatmap_message(
                 p,

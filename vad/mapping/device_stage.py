@@ -4,19 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vad.mapping.arrival_likelihood import arrival_sums
-from vad.mapping.doppler_likelihood import (
-    SPEED_OF_LIGHT_MPS,
-    DopplerModel,
-    doppler_log_likelihood,
-    log_heard,
-)
+from vad.mapping.doppler_likelihood import SPEED_OF_LIGHT_MPS, DopplerModel, log_heard
+from vad.mapping.doppler_search import OFFSETS_S, DopplerSearch
 from vad.mapping.evidence import Terms
 from vad.mapping.paper import THRESHOLD_OFFICE_M, algorithm_1
 from vad.mapping.posterior import Grid, Posterior
@@ -39,11 +34,6 @@ MIN_BREADTH_M = 0.25
 
 SOLVE_STEP_M = 0.2
 """Likelihoods are computed this finely and interpolated: no region is sharper than a few such steps."""
-
-OFFSETS_S = (-0.45, -0.3, -0.15, 0.0, 0.15, 0.3, 0.45)
-OFFSET_SIGMA_S = 0.25
-OFFSET_STEP_M = 0.5
-"""The time offset between camera and CSI is found on a grid this coarse, then held."""
 
 MAX_RADIUS90_M = 2.5
 """A wider 90 % region is no place."""
@@ -113,9 +103,13 @@ def evidence_from_walk(
     grid: Grid,
     *,
     model: DopplerModel | None = None,
+    offsets_s: tuple[float, ...] = OFFSETS_S,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> Evidence:
-    """Solve one walk: Doppler of the whole spectrogram; where the device has the antennas, their phases."""
+    """Solve one walk: Doppler of the whole spectrogram; where the device has the antennas, their phases.
+
+    offsets_s: by how much the walk's stamps may be early.
+    """
     reason = _unusable(recording)
     if reason:
         return _refused(reason)
@@ -133,11 +127,16 @@ def evidence_from_walk(
     phases = None
     if antennas > 1 and recording.array_end == "device":
         phases = arrival_phases(aligned, antennas, spectra.t_ns, path.f_hz)
-    solve = partial(_terms, recording, spectra, phases, model=model, should_stop=should_stop)
-    offset_s = _time_offset_s(solve, grid)
-    terms = None
-    if offset_s is not None:
-        terms = solve(Grid.over(grid.bounds_m, max(SOLVE_STEP_M, grid.step_m)), offset_s)
+    search = DopplerSearch(
+        spectra,
+        walk,
+        recording.anchor_m,
+        wavelength_m,
+        recording.anchor_z_m,
+        model or DopplerModel(),
+        should_stop,
+    )
+    terms = _terms(search, phases, grid, offsets_s)
     if terms is None:
         return _refused("stopped before the end", spectra)
     posterior = terms.posterior(grid)
@@ -150,48 +149,21 @@ def evidence_from_walk(
 
 
 def _terms(
-    recording: Recording,
-    spectra: Spectrogram,
-    phases: ArrivalPhases | None,
-    grid: Grid,
-    offset_s: float,
-    *,
-    model: DopplerModel | None,
-    should_stop: Callable[[], bool],
+    search: DopplerSearch, phases: ArrivalPhases | None, bounds: Grid, offsets_s: tuple[float, ...]
 ) -> Terms | None:
-    """The evidence on `grid` if camera and CSI clocks differ by offset_s; None when asked to stop."""
-    points, walk = grid.points_m, recording.walk.later(offset_s)
-    doppler = doppler_log_likelihood(
-        spectra,
-        walk,
-        recording.anchor_m,
-        points,
-        wavelength_m=recording.wavelength_m,
-        anchor_z_m=recording.anchor_z_m,
-        model=model,
-        should_stop=should_stop,
-    )
+    """The evidence over the extent of `bounds`; None when asked to stop."""
+    offset_s = search.time_offset_s(bounds, offsets_s)
+    if offset_s is None:
+        return None
+    grid = Grid.over(bounds.bounds_m, max(SOLVE_STEP_M, bounds.step_m))
+    doppler = search.over(grid, offset_s)
     if doppler is None:
         return None
+    points, walk = grid.points_m, search.walk.later(offset_s)
     sums = None
     if phases is not None:
-        sums = arrival_sums(phases, walk, points, wavelength_m=recording.wavelength_m)
+        sums = arrival_sums(phases, walk, points, wavelength_m=search.wavelength_m)
     return Terms(grid, 1, doppler, log_heard(points, walk), sums)
-
-
-def _time_offset_s(solve: Callable[[Grid, float], Terms | None], grid: Grid) -> float | None:
-    """How much later the walk is than its stamps say: the posterior mean over a coarse grid of places."""
-    coarse = Grid.over(grid.bounds_m, max(OFFSET_STEP_M, grid.step_m))
-    weights = []
-    for offset_s in OFFSETS_S:
-        terms = solve(coarse, offset_s)
-        if terms is None:
-            return None
-        total = terms.log_density()
-        weights.append(np.log(np.sum(np.exp(total - total.max()))) + total.max())
-    log_weight = np.array(weights) - 0.5 * (np.array(OFFSETS_S) / OFFSET_SIGMA_S) ** 2
-    weight = np.exp(log_weight - log_weight.max())
-    return float(np.sum(weight * OFFSETS_S) / weight.sum())
 
 
 def place_from_posterior(posterior: Posterior) -> PlaceEstimate:

@@ -1,80 +1,58 @@
 """Direct position determination with an uncertain track: ask the whole spectrogram about each candidate.
 
-For a candidate R the walk predicts f_R(t) = -(kappa / lambda) d/dt(|P T| + |P R|); the spectrogram's
-log-likelihood along that line is the candidate's (method.md 2). The track is not exact: its errors, along
-and across the path and in time, lengthen or shorten the path by a slowly varying deviation d(t). A hidden
-Markov model over (d, d/dt) sums over all ways it may have gone: d/dt shifts the line in frequency, d is
-held near zero, so that what the track says of the whole walk still counts. kappa, the share of the walker's
-speed that the reflecting surface shows, is averaged over. Neither end of the link is favoured.
+For a candidate R the walk predicts f_R(t) = -(kappa / lambda) d/dt L(t), L = |P T| + |P R| less what the
+body's surface saves; the spectrogram's log-likelihood along that line is the candidate's (method.md 2).
+Nothing in the line is exact: the track's errors seen from both ends, kappa, the body's surface, heights,
+the clocks, and what limbs and walls do to the Doppler make a Gaussian deviation of known covariance. It is
+summed over by Laplace's method: expectation-maximisation climbs to the likeliest deviation, as mean shift
+does in a histogram, and the curvature there gives the volume. Neither end of the link is favoured.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vad.mapping.doppler_line import LineModel, PredictedLines, predicted_lines
 from vad.mapping.walk import WalkTrack
 from vad.sensing.spectrogram import Spectrogram
 
 FloatArray = NDArray[np.float64]
 
 SPEED_OF_LIGHT_MPS = 299_792_458.0
+_AT_ONCE = 256
+"""Candidates whose matrices are worked on together: what fits a small machine's memory."""
 
 
 @dataclass(frozen=True, slots=True)
 class DopplerModel:
-    """What is assumed of the walk. Heights are those of the ends above or below the torso: the first two
-    where no height is known, device_off_torso_m (usual in a home) where the anchor's is.
+    """What is assumed of the walk and of its spectrogram.
 
-    deviation_per_sigma: standard deviation of the path's deviation, in units of the track's stated sigma_m
-    (two ends see the same error; recorded tracks understate their errors in time); correlation_s: how long
-    its rate lasts. temper: the share of a frame's log-likelihood that counts, as neighbouring frames share
-    their windows. Chosen on the plain-room recordings and on simulated homes together.
+    line: of the prediction; frame_step_s: between the frames that are asked; temper: how much a frame counts;
+    kernels_hz: widths within which the ridge is looked for around the line, from first to last step;
+    signal_share: probability that a frame holds the walker's ridge at all. Chosen on the plain-room
+    recordings and on the simulated set-ups together.
     """
 
-    kappas: tuple[float, ...] = (0.86, 0.93, 1.0)
-    torso_z_m: float = 1.05
-    device_above_torso_m: float = 0.8
-    device_off_torso_m: float = 0.4
-    anchor_above_torso_m: float = 1.0
-    deviation_per_sigma: float = 1.7
-    min_deviation_m: float = 0.05
-    max_deviation_m: float = 0.3
-    correlation_s: float = 0.8
-    smoothing_s: float = 0.4
-    temper: float = 0.4
-    frame_step_s: float = 0.1
+    line: LineModel = field(default_factory=LineModel)
+    frame_step_s: float = 0.2
+    temper: float = 1.4
+    kernels_hz: tuple[float, ...] = (6.0, 4.0, 3.4)
+    signal_share: float = 0.85
 
 
 @dataclass(frozen=True, slots=True)
-class _Deviations:
-    """The hidden states: deviation and rate on a grid (D, V), and how they go on in one frame."""
+class _Tables:
+    """What a frame says around each bin, (F, B): log-likelihood; share of it that is the ridge's; the ridge's
+    frequency there; how sharp the likelihood is, 0..1 in units of the kernel's own."""
 
-    rates_mps: FloatArray
-    start: NDArray[np.float32]
-    step: NDArray[np.float32]
-
-
-def predicted_doppler_hz(
-    points_m: FloatArray,
-    walk: WalkTrack,
-    anchor_m: FloatArray,
-    t_ns: NDArray[np.int64],
-    *,
-    wavelength_m: float,
-    model: DopplerModel,
-    anchor_z_m: float | None = None,
-) -> FloatArray:
-    """f_R(t) for kappa = 1: (F, G) for candidates points_m (G, 2) at times t_ns (F,), map frame."""
-    position, velocity = walk.position_m(t_ns), walk.velocity_mps(t_ns)
-    anchor_dz = model.anchor_above_torso_m if anchor_z_m is None else anchor_z_m - model.torso_z_m
-    anchor_rate = _range_rate(position[:, None] - anchor_m, velocity, anchor_dz)
-    device_dz = model.device_above_torso_m if anchor_z_m is None else model.device_off_torso_m
-    device_rate = _range_rate(position[:, None] - points_m[None], velocity, device_dz)
-    return np.asarray(-(anchor_rate + device_rate) / wavelength_m)
+    log_likelihood: FloatArray
+    ridge_share: FloatArray
+    centre_hz: FloatArray
+    sharpness: FloatArray
 
 
 def doppler_log_likelihood(
@@ -90,34 +68,32 @@ def doppler_log_likelihood(
 ) -> FloatArray | None:
     """log p(spectrogram | device at each of points_m), (G,), up to a constant.
 
-    anchor_m: (2,) the known end of the link, map frame. None when `should_stop` asked to give up.
+    anchor_m: (2,) the known end of the link, map frame; anchor_z_m its height where known. None when
+    `should_stop` asked to give up.
     """
     model = model or DopplerModel()
-    hop_ns = int(np.median(np.diff(spectrogram.t_ns))) if len(spectrogram.t_ns) > 1 else 50_000_000
-    frames = np.arange(0, len(spectrogram.t_ns), max(1, round(model.frame_step_s * 1e9 / hop_ns)))
-    frames = frames[walk.covers(spectrogram.t_ns[frames])]
-    heard = spectrogram.log_likelihood[frames] * spectrogram.weight[frames, None]
-    table = np.exp(model.temper * heard).astype(np.float32)
-    sigma_m = float(np.median(walk.sigma_m))
-    deviations = _deviations(model, sigma_m)
-    line_hz = predicted_doppler_hz(
-        points_m,
-        walk.smoothed(model.smoothing_s),
-        anchor_m,
-        spectrogram.t_ns[frames],
-        wavelength_m=wavelength_m,
-        model=model,
-        anchor_z_m=anchor_z_m,
-    ).astype(np.float32)
-    shift_hz = (-deviations.rates_mps / wavelength_m).astype(np.float32)
-    scores = []
-    for kappa in model.kappas:
+    hop_s = np.median(np.diff(spectrogram.t_ns)) / 1e9 if len(spectrogram.t_ns) > 1 else 0.05
+    frames = np.arange(0, len(spectrogram.t_ns), max(1, round(model.frame_step_s / hop_s)))
+    frames = frames[walk.covers(spectrogram.t_ns[frames]) & (spectrogram.weight[frames] > 0)]
+    if len(frames) == 0:
+        return np.zeros(len(points_m))
+    tables = [_tables(spectrogram, frames, width, model.signal_share) for width in model.kernels_hz]
+    seen = walk.seen_at(spectrogram.t_ns[frames], model.line.smoothing_s)
+    result = np.empty(len(points_m))
+    for start in range(0, len(points_m), _AT_ONCE):
         if should_stop():
             return None
-        scores.append(_forward(table, spectrogram.f_hz, np.float32(kappa) * line_hz, shift_hz, deviations))
-    stacked = np.array(scores)
-    top = stacked.max()
-    return np.asarray(np.log(np.mean(np.exp(stacked - top), axis=0) + 1e-300) + top)
+        chunk = slice(start, start + _AT_ONCE)
+        lines = predicted_lines(
+            points_m[chunk],
+            seen,
+            anchor_m,
+            wavelength_m=wavelength_m,
+            anchor_z_m=anchor_z_m,
+            model=model.line,
+        )
+        result[chunk] = _evidence(lines, tables, spectrogram.f_hz, model)
+    return result
 
 
 def log_heard(points_m: FloatArray, walk: WalkTrack) -> FloatArray:
@@ -131,63 +107,50 @@ def log_heard(points_m: FloatArray, walk: WalkTrack) -> FloatArray:
     return np.asarray(np.log(np.mean(1 / (squared + 1), axis=1)))
 
 
-def _deviations(model: DopplerModel, sigma_m: float) -> _Deviations:
-    """A damped random motion of d with the stated standard deviations, on a grid of its values."""
-    sigma_d = float(
-        np.clip(model.deviation_per_sigma * sigma_m, model.min_deviation_m, model.max_deviation_m)
-    )
-    sigma_v = sigma_d / model.correlation_s
-    values = np.linspace(-2.5 * sigma_d, 2.5 * sigma_d, 9)
-    rates = np.linspace(-3 * sigma_v, 3 * sigma_v, 9)
-    dt = model.frame_step_s
-    keep = np.exp(-dt / model.correlation_s)
-    spread = max(sigma_v * np.sqrt(1 - keep**2), 0.4 * (rates[1] - rates[0]))
-    pull = (sigma_v / sigma_d) ** 2
-    count = len(values) * len(rates)
-    step = np.zeros((count, count), dtype=np.float32)
-    for i, value in enumerate(values):
-        for j, rate in enumerate(rates):
-            to_rate = np.exp(-0.5 * ((rates - (keep * rate - pull * value * dt)) / spread) ** 2)
-            to_rate /= to_rate.sum()
-            place = (value + rate * dt - values[0]) / (values[1] - values[0])
-            low = int(np.floor(place))
-            for row, share in ((low, 1 - (place - low)), (low + 1, place - low)):
-                if 0 <= row < len(values):
-                    step[row * len(rates) : (row + 1) * len(rates), i * len(rates) + j] += share * to_rate
-    start = np.exp(-0.5 * (values / sigma_d) ** 2)[:, None] * np.exp(-0.5 * (rates / sigma_v) ** 2)[None]
-    return _Deviations(rates, (start / start.sum()).astype(np.float32).reshape(-1, 1), step)
+def _tables(
+    spectrogram: Spectrogram, frames: NDArray[np.int64], width_hz: float, signal_share: float
+) -> _Tables:
+    """A frame's power as a density of the ridge's frequency, under a Gaussian kernel of width_hz."""
+    f_hz = spectrogram.f_hz
+    power = spectrogram.power[frames] / len(f_hz)
+    kernel = np.exp(-0.5 * ((f_hz[:, None] - f_hz[None]) / width_hz) ** 2)
+    near = np.maximum(power @ kernel, 1e-12)
+    centre_hz = (power * f_hz) @ kernel / near
+    spread_hz2 = np.maximum((power * f_hz**2) @ kernel / near - centre_hz**2, 0.0)
+    bins_wide = np.sqrt(2 * np.pi) * width_hz / (f_hz[1] - f_hz[0])
+    ridge = signal_share * len(f_hz) * near / bins_wide
+    likelihood = ridge + 1 - signal_share
+    sharpness = np.clip(1 - spread_hz2 / width_hz**2, 0.05, 1.0)
+    return _Tables(np.log(likelihood), ridge / likelihood, centre_hz, sharpness)
 
 
-def _forward(
-    table: NDArray[np.float32],
-    f_axis_hz: FloatArray,
-    line_hz: NDArray[np.float32],
-    shift_hz: NDArray[np.float32],
-    deviations: _Deviations,
+def _evidence(
+    lines: PredictedLines, tables: list[_Tables], f_hz: FloatArray, model: DopplerModel
 ) -> FloatArray:
-    """The forward algorithm for all candidates at once: log-evidence (G,).
+    """log of the evidence (G,), the deviation from each line summed over."""
+    step_hz, frame = f_hz[1] - f_hz[0], np.arange(lines.f_hz.shape[1])
+    covariance, deviation = lines.covariance_hz2, np.zeros_like(lines.f_hz)
+    diagonal = np.arange(len(frame))
 
-    table (F, B): tempered likelihood; line_hz (F, G): undisturbed prediction; shift_hz (V,): by each rate.
-    """
-    candidates = line_hz.shape[1]
-    step_hz = f_axis_hz[1] - f_axis_hz[0]
-    belief = np.repeat(deviations.start, candidates, axis=1)
-    total = np.zeros(candidates)
-    rates = len(shift_hz)
-    for k in range(len(table)):
-        if k:
-            belief = deviations.step @ belief
-        bins = (line_hz[k][None] + shift_hz[:, None] - f_axis_hz[0]) / step_hz + 0.5
-        seen = table[k][np.clip(bins, 0, table.shape[1] - 1).astype(np.int32)]
-        belief.reshape(-1, rates, candidates)[...] *= seen[None]
-        norm = belief.sum(axis=0)
-        total += np.log(norm)
-        belief /= norm
-    return total
+    def bins() -> NDArray[np.int64]:
+        place = (lines.f_hz + deviation - f_hz[0]) / step_hz + 0.5
+        return np.asarray(np.clip(place, 0, len(f_hz) - 1), dtype=np.int64)
 
+    def whitened(root: FloatArray) -> FloatArray:
+        matrix = covariance * root[:, :, None] * root[:, None, :]
+        matrix[:, diagonal, diagonal] += 1
+        return matrix
 
-def _range_rate(offset_m: FloatArray, velocity_mps: FloatArray, dz_m: float) -> FloatArray:
-    """d/dt of the distance for offsets (F, G, 2) at velocities (F, 2); (F, G)."""
-    distance = np.sqrt(offset_m[..., 0] ** 2 + offset_m[..., 1] ** 2 + dz_m**2 + 1e-6)
-    along = offset_m[..., 0] * velocity_mps[:, None, 0] + offset_m[..., 1] * velocity_mps[:, None, 1]
-    return np.asarray(along / distance)
+    at = bins()
+    for table, width_hz in zip(tables, model.kernels_hz, strict=True):
+        root = np.sqrt(model.temper * table.ridge_share[frame, at]) / width_hz
+        off = (root * (table.centre_hz[frame, at] - lines.f_hz))[..., None]
+        pull = root * np.linalg.solve(whitened(root), off)[..., 0]
+        deviation = np.matmul(covariance, pull[..., None])[..., 0]
+        at = bins()
+    last = tables[-1]
+    root = np.sqrt(model.temper * last.ridge_share[frame, at] * last.sharpness[frame, at])
+    factor = np.linalg.cholesky(whitened(root / model.kernels_hz[-1]))
+    log_volume = np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
+    fit = model.temper * last.log_likelihood[frame, at].sum(axis=1)
+    return np.asarray(fit - 0.5 * (pull * deviation).sum(axis=1) - log_volume)

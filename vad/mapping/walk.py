@@ -9,7 +9,34 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-_VELOCITY_BASE_S = 0.1
+_BASE_S = 0.2
+_LEAST_SLOW_SHARE = 0.2
+"""No track's errors are all new at every point: at least this share of sigma_m lasts."""
+
+
+@dataclass(frozen=True, slots=True)
+class SeenWalk:
+    """A track under a window, a little before and after F instants t_s (F,), seconds.
+
+    ahead_m, behind_m (F, 2): base_s apart. The rest tells what the errors do to velocities.
+    """
+
+    t_s: FloatArray
+    ahead_m: FloatArray
+    behind_m: FloatArray
+    base_s: float
+    _difference: FloatArray
+    _lag_s: FloatArray
+    _white_m: float
+    _slow_m: float
+
+    def velocity_covariance(self, share: float, correlation_s: float) -> FloatArray:
+        """(F, F) m^2/s^2 along one axis: the track's errors that are new at each point, and of those that
+        last a share, smooth over correlation_s (Matern 3/2)."""
+        lag = np.sqrt(3) * self._lag_s / correlation_s
+        errors = (share * self._slow_m) ** 2 * (1 + lag) * np.exp(-lag)
+        errors[np.diag_indices_from(errors)] += self._white_m**2
+        return np.asarray(self._difference @ errors @ self._difference.T)
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,29 +57,36 @@ class WalkTrack:
         t_s, at_s = self._seconds(t_ns)
         return np.stack([np.interp(at_s, t_s, self.xy_m[:, k]) for k in (0, 1)], axis=1)
 
-    def velocity_mps(self, t_ns: NDArray[np.int64]) -> FloatArray:
-        """Velocities (N, 2) as central differences over 0.2 s."""
-        half_ns = int(_VELOCITY_BASE_S * 1e9)
-        ahead, behind = self.position_m(t_ns + half_ns), self.position_m(t_ns - half_ns)
-        t_s, at_s = self._seconds(t_ns)
-        base_s = np.minimum(at_s + _VELOCITY_BASE_S, t_s[-1]) - np.maximum(at_s - _VELOCITY_BASE_S, t_s[0])
-        return np.asarray((ahead - behind) / np.maximum(base_s, 1e-3)[:, None], dtype=np.float64)
-
     def later(self, offset_s: float) -> WalkTrack:
         """The same walk, its stamps raised by offset_s."""
         return WalkTrack(self.t_ns + int(offset_s * 1e9), self.xy_m, self.sigma_m)
 
-    def smoothed(self, window_s: float) -> WalkTrack:
-        """The track at 20 Hz under a Hann window of `window_s`: a walker's mass, not a detector's jitter."""
-        t_ns = np.arange(self.t_ns[0], self.t_ns[-1] + 1, 50_000_000)
-        width = max(1, round(window_s / 0.05)) | 1
-        kernel = np.hanning(width + 2)[1:-1]
-        kernel /= kernel.sum()
-        half = width // 2
-        padded = np.pad(self.position_m(t_ns), ((half, half), (0, 0)), mode="edge")
-        xy = np.stack([np.convolve(padded[:, k], kernel, mode="valid") for k in (0, 1)], axis=1)
+    def seen_at(self, t_ns: NDArray[np.int64], half_width_s: float) -> SeenWalk:
+        """The track under a Hann window (a walker's mass, not a detector's jitter) around t_ns (F,)."""
         t_s, at_s = self._seconds(t_ns)
-        return WalkTrack(t_ns, xy, np.interp(at_s, t_s, self.sigma_m))
+        ahead, behind = (_hann(t_s, at_s + shift, half_width_s) for shift in (_BASE_S / 2, -_BASE_S / 2))
+        white_m = min(self.white_m, float(np.median(self.sigma_m)))
+        sigma_m = float(np.median(self.sigma_m))
+        slow_m = np.sqrt(max(sigma_m**2 - white_m**2, (_LEAST_SLOW_SHARE * sigma_m) ** 2))
+        return SeenWalk(
+            at_s,
+            ahead @ self.xy_m,
+            behind @ self.xy_m,
+            _BASE_S,
+            (ahead - behind) / _BASE_S,
+            np.abs(t_s[:, None] - t_s[None]),
+            white_m,
+            float(slow_m),
+        )
+
+    @property
+    def white_m(self) -> float:
+        """Standard deviation along an axis of what is new at each point, from second differences, which a
+        walker's own movement hardly reaches."""
+        if len(self.xy_m) < 5:
+            return 0.0
+        bend = self.xy_m[2:] - 2 * self.xy_m[1:-1] + self.xy_m[:-2]
+        return float(1.4826 * np.median(np.abs(bend)) / np.sqrt(6))
 
     @property
     def length_m(self) -> float:
@@ -71,3 +105,12 @@ class WalkTrack:
 
     def _seconds(self, t_ns: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
         return (self.t_ns - self.t_ns[0]) / 1e9, (t_ns - self.t_ns[0]) / 1e9
+
+
+def _hann(t_s: FloatArray, at_s: FloatArray, half_width_s: float) -> FloatArray:
+    """Weights (F, M) of points at t_s (M,) for windows around at_s (F,), each row's sum 1."""
+    x = (t_s[None] - at_s[:, None]) / half_width_s
+    weights = np.where(np.abs(x) < 1, 0.5 * (1 + np.cos(np.pi * x)), 0.0)
+    nearest = np.argmin(np.abs(x), axis=1)
+    weights[np.arange(len(at_s)), nearest] += 1e-3  # a window between sparse points holds none
+    return np.asarray(weights / weights.sum(axis=1, keepdims=True))

@@ -8,7 +8,8 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from vad.mapping.doppler_likelihood import SPEED_OF_LIGHT_MPS, DopplerModel, predicted_doppler_hz
+from vad.mapping.doppler_likelihood import SPEED_OF_LIGHT_MPS
+from vad.mapping.doppler_line import predicted_doppler_hz
 from vad.solve import Solved, walk_of
 
 mpl.use("Agg")
@@ -58,7 +59,6 @@ def _spectrogram_figure(solved: Solved) -> Figure:
             np.array([anchor.x_m, anchor.y_m]),
             spectrogram.t_ns[inside],
             wavelength_m=SPEED_OF_LIGHT_MPS / session.header.radio.carrier_hz,
-            model=DopplerModel(),
             anchor_z_m=anchor.z_m,
         )
         axes.plot(t_s[inside], f_hz[:, 0], color=colour, lw=1.2, ls="--", label=f"predicted for the {name}")
