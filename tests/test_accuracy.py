@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from vad.sim.paper_setups import Setup
@@ -15,7 +17,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 
 from bench_locate import run_unit
 from bench_locate_cases import home_cases, paper_cases, recorded
-from bench_locate_score import Case, Score
+from bench_locate_score import Case, Score, solve
 
 
 def judged(cases: Callable[[], Iterator[list[Case]]], tag: str) -> tuple[list[Score], Score]:
@@ -60,3 +62,39 @@ def test_recordings() -> None:
     assert worst_m(single) < 0.8
     assert error_m(fused) < 0.45
     assert sum(bool(s.in90) for s in single) >= 2
+
+
+def damaged() -> Iterator[tuple[str, Case]]:
+    """One walk of the open-space set-up, each time with something missing."""
+    case = next(paper_cases("open", 0, 2))[0]
+    recording, rng = case.recording, np.random.default_rng(3)
+    t_ns, csi, walk = recording.t_ns, recording.csi, recording.walk
+    middle_ns = int(t_ns[len(t_ns) // 2])
+    for name, kept in (
+        ("whole", np.full(len(t_ns), True)),
+        ("30 % lost", rng.random(len(t_ns)) > 0.3),
+        ("a hole of 2 s", np.abs(t_ns - middle_ns) > 1_000_000_000),
+        ("cut off halfway", t_ns < middle_ns),
+    ):
+        yield name, replace(case, recording=replace(recording, t_ns=t_ns[kept], csi=csi[kept]))
+    for name, stands in (("stands still", (0.0, 0.0)), ("straight", (0.12, 0.05))):
+        steps = np.arange(len(walk.t_ns))[:, None] * np.array(stands) * 0.5
+        track = replace(walk, xy_m=walk.xy_m[:1] + steps)
+        yield name, replace(case, recording=replace(recording, walk=track))
+
+
+def test_what_is_missing_widens_the_region_or_is_refused() -> None:
+    """Never a confident wrong point (the walk that does not fit the packets at all has no truth to hold)."""
+    radius_m = {}
+    for name, case in damaged():
+        score, evidence = solve(case)
+        radius_m[name] = score.radius90_m
+        if name in ("stands still", "straight"):
+            assert score.status != "located", name
+            assert evidence.reason
+        else:
+            assert score.in90, name
+    whole_m, half_m = radius_m["whole"], radius_m["cut off halfway"]
+    assert whole_m is not None
+    assert half_m is not None
+    assert half_m > whole_m
