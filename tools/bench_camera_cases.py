@@ -7,9 +7,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from vad.mapping import camera_consensus as mapping
 from vad.mapping.camera_calibration import CameraCalibration
-from vad.mapping.camera_consensus import Sightings
+from vad.mapping.camera_contact import recontacted
 from vad.mapping.camera_fit import Start, information
+from vad.mapping.camera_spread import best_of_each
 from vad.mapping.camera_stage import CameraMapper
 from vad.mapping.camera_track import PoseTrack
 from vad.sim.camera_drive import (
@@ -30,6 +32,7 @@ from vad.vision.robot import RobotFinder
 FRAME_HZ = 10.0
 POSE_HZ = 10.0
 _S_NS = 1_000_000_000
+_ROBOT_WITHIN_PX = 15.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +110,8 @@ def rendered(drive: Drive, network: PoseNetwork) -> list[Candidates]:
         found = finder.update(image, boxes)
         if found:
             px = np.array([[c.x_px, c.y_px] for c in found])
-            frames.append(Candidates(t, px, np.array([c.sigma_px for c in found])))
+            sigma_px = np.array([c.sigma_px for c in found])
+            frames.append(Candidates(t, px, sigma_px, np.array([c.box for c in found])))
     return frames
 
 
@@ -124,7 +128,7 @@ def solve(source: str, variant: Variant, seed: int, drive: Drive, frames: list[C
     for t, (x, y) in zip(*poses_of(drive, variant, rng), strict=True):
         mapper.add_pose(round(t * _S_NS), float(x), float(y), POSE_SIGMA_M)
     for frame in frames:
-        mapper.add_candidates(round(frame.t_s * _S_NS), frame.px, frame.sigma_px)
+        mapper.add_candidates(round(frame.t_s * _S_NS), frame.px, frame.sigma_px, frame.box)
     begun = time.process_time()
     result = mapper.solve()
     spent_s = time.process_time() - begun
@@ -165,14 +169,16 @@ def compared(
 
 def _seen(drive: Drive, frames: list[Candidates], result: CameraCalibration) -> float:
     """Mean distance of the found robot's floor point from its true place, over frames that show it."""
+    assert result.intrinsics is not None
+    assert result.camera_from_map is not None
+    at = Start(result.intrinsics, result.camera_from_map, 0.0)
+    plain = [mapping.Candidates.of(round(f.t_s * _S_NS), f.px, f.sigma_px, f.box) for f in frames]
+    found = recontacted(mapping.sightings_of(plain, 0), at)
     truth = drive.robot_xy_m(np.array([f.t_s for f in frames]))
-    expected = drive.pixels(truth)
-    nearest = [
-        f.px[np.argmin(np.linalg.norm(f.px - px, axis=1))] for f, px in zip(frames, expected, strict=True)
-    ]
-    near = np.linalg.norm(np.array(nearest) - expected, axis=1) < 15.0
-    xy, _ = result.floor_point(np.array(nearest)[near], PIXEL_SIGMA)
-    return float(np.nanmean(np.linalg.norm(xy - truth[near], axis=1)))
+    off_px = np.linalg.norm(found.image_px - drive.pixels(truth)[found.frame], axis=1)
+    xy, _ = result.floor_point(found.image_px, PIXEL_SIGMA)
+    best = best_of_each(found.frame, off_px, _ROBOT_WITHIN_PX)
+    return float(np.nanmean(np.linalg.norm(xy - truth[found.frame], axis=1)[best]))
 
 
 def position_bound_m(drive: Drive, variant: Variant) -> float:
@@ -187,7 +193,9 @@ def position_bound_m(drive: Drive, variant: Variant) -> float:
     px = drive.pixels(drive.robot_xy_m(t_s))
     pixel_sigma = PIXEL_SIGMA * np.sqrt(rate_hz / FRAME_HZ)
     seen = np.isfinite(px[:, 0])
-    pairs = Sightings(np.flatnonzero(seen), t_s[seen], px[seen], np.full(int(seen.sum()), pixel_sigma))
+    pairs = mapping.Sightings(
+        np.flatnonzero(seen), t_s[seen], px[seen], np.full(int(seen.sum()), pixel_sigma)
+    )
     at = Start(drive.lens, drive.camera_from_map, 0.0)
     covariance = np.linalg.inv(information(at, pairs, track, lens_known=variant.lens_known))
     return float(np.sqrt(np.trace(covariance[3:6, 3:6])))

@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 
 from vad.commands.app import app
 from vad.commands.camera_tables import check_json, check_table, progress_table, result_json, rows_of
-from vad.mapping.camera_calibration import CameraCalibration
-from vad.mapping.camera_stage import CameraMapper, Deviations
+from vad.mapping.camera_calibration import CameraCalibration, Deviations
+from vad.mapping.camera_stage import CameraMapper
 from vad.report.camera_overlay import draw_overlay
 from vad.sim.camera_drive import POSE_SIGMA_M, Drive, make_drive
 

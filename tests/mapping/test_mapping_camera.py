@@ -12,9 +12,13 @@ from numpy.typing import NDArray
 
 from vad.geometry import Intrinsics, Rigid, look_at, project
 from vad.mapping.camera_calibration import CameraCalibration
+from vad.mapping.camera_consensus import Candidates, Sightings, sightings_of
+from vad.mapping.camera_contact import recontacted
+from vad.mapping.camera_fit import Start
 from vad.mapping.camera_spread import best_of_each, spread, spread_selection
 from vad.mapping.camera_stage import CameraMapper
 from vad.mapping.camera_track import PoseTrack
+from vad.vision.robot import disc_contact
 
 Array = NDArray[np.float64]
 S_NS = 1_000_000_000
@@ -386,3 +390,28 @@ def test_helpers() -> None:
 def test_intrinsics_of_another_size_are_refused() -> None:
     with pytest.raises(ValueError, match="size"):
         CameraMapper(1280, 720, Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0))
+
+
+def test_contacts_of_boxes_come_from_where_the_camera_is() -> None:
+    """A robot flatter than assumed: contacts made from its boxes alone are off, those of the fit are not."""
+    scene = simulate("rectangle", 3)
+    lens, pose = scene.lens, scene.camera_from_map
+    truth = scene.truth[300:-300:40]
+    angle = np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)
+    ring = 0.17 * np.column_stack([np.cos(angle), np.sin(angle)])
+    outline = np.concatenate(
+        [np.concatenate([xy + ring, xy + ring]) for xy in truth],
+    )
+    heights = np.tile(np.repeat([0.0, 0.06], 60), len(truth))
+    px = project(np.column_stack([outline, heights]), lens, pose).reshape(len(truth), 120, 2)
+    boxes = np.concatenate([px.min(axis=1), px.max(axis=1)], axis=1)
+    crude = np.array([disc_contact(*box) for box in boxes.tolist()])
+    right = project(np.column_stack([truth, np.zeros(len(truth))]), lens, pose)
+    sightings = Sightings(
+        np.arange(len(truth)), np.arange(len(truth)) * 0.4, crude, np.ones(len(truth)), boxes
+    )
+    seen = recontacted(sightings, Start(lens, pose, 0.0))
+    assert float(np.median(np.linalg.norm(crude - right, axis=1))) > 1.0
+    assert float(np.median(np.linalg.norm(seen.image_px - right, axis=1))) < 0.4
+    none = sightings_of([Candidates.of(0, crude, 1.0, None)], 0)
+    assert recontacted(none, Start(lens, pose, 0.0)) is none

@@ -34,8 +34,7 @@ from vad.streams import DropOldestQueue
 
 if TYPE_CHECKING:  # cv2 and onnxruntime take a second to import
     from vad.daemon.eyes import Eyes
-    from vad.mapping.camera_calibration import CameraCalibration
-    from vad.mapping.camera_stage import Deviations
+    from vad.mapping.camera_calibration import CameraCalibration, Deviations
     from vad.robot.floor_plan import FloorPlan
 
 REFRESH_S = 1.0

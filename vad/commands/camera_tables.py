@@ -12,8 +12,7 @@ from rich.text import Text
 from vad.report.words import printable
 
 if TYPE_CHECKING:
-    from vad.mapping.camera_calibration import CameraCalibration
-    from vad.mapping.camera_stage import Deviations
+    from vad.mapping.camera_calibration import CameraCalibration, Deviations
 
 _STYLES = {"valid": "green", "collecting": "yellow", "recalibrating": "yellow", "invalid": "red"}
 

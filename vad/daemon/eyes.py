@@ -15,9 +15,8 @@ from vad.camera.frame import Frame
 from vad.daemon.walkers import PeopleSeen, Walkers
 from vad.geometry import Intrinsics
 from vad.health import Health
-from vad.mapping.camera_calibration import CameraCalibration
+from vad.mapping.camera_calibration import CameraCalibration, Deviations
 from vad.mapping.camera_keeper import LOOK_EVERY_NS, CameraKeeper
-from vad.mapping.camera_stage import Deviations
 from vad.mapping.walk import WalkTrack
 from vad.robot.pose import RobotPose
 from vad.streams import DropOldestQueue
@@ -193,7 +192,8 @@ class Eyes:
         self._poses.clear()
         if candidates:
             places = np.array([[c.x_px, c.y_px] for c in candidates])
-            keeper.add_candidates(frame.t_ns, places, np.array([c.sigma_px for c in candidates]))
+            boxes = np.array([c.box if c.from_box else (np.nan,) * 4 for c in candidates])
+            keeper.add_candidates(frame.t_ns, places, np.array([c.sigma_px for c in candidates]), boxes)
             self._new_evidence = True
         before = keeper.calibration
         if frame.t_ns - self._looked_ns > LOOK_EVERY_NS:

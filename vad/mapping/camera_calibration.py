@@ -177,6 +177,19 @@ class CameraCalibration:
             raise ValueError(f"not a complete {SCHEMA} record: {error}") from error
 
 
+@dataclass(frozen=True, slots=True)
+class Deviations:
+    """Robot against camera. robot_m, camera_m: (N, 2) floor points, map frame; image_px: (N, 2) where it was
+    found, raw; agreeing: share of the pictures that should show the robot in which it was found where it
+    should be; path_m: (M, 2) all of the robot's path."""
+
+    robot_m: FloatArray
+    camera_m: FloatArray
+    image_px: FloatArray
+    agreeing: float
+    path_m: FloatArray
+
+
 def _on_floor(px: FloatArray, lens: Intrinsics, camera_from_map: Rigid) -> FloatArray:
     straight = undistort(px, lens)
     rays = np.column_stack(

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from vad.geometry import FloatArray, apply_homography
 from vad.mapping.camera_track import PoseTrack
@@ -28,17 +29,50 @@ class Sightings:
     """What the camera offers: K candidates of all frames together.
 
     frame: (K,) index of the frame; t_s: (K,) its time from the track's origin; image_px: (K, 2) raw;
-    sigma_px: (K,).
+    sigma_px: (K,). box: (K, 4) x0, y0, x1, y1 where the contact was made from a box, raw, NaN elsewhere.
     """
 
     frame: NDArray[np.int64]
     t_s: FloatArray
     image_px: FloatArray
     sigma_px: FloatArray
+    box: FloatArray | None = None
 
     def take(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Sightings:
         """The chosen candidates."""
-        return Sightings(self.frame[rows], self.t_s[rows], self.image_px[rows], self.sigma_px[rows])
+        box = None if self.box is None else self.box[rows]
+        return Sightings(self.frame[rows], self.t_s[rows], self.image_px[rows], self.sigma_px[rows], box)
+
+
+@dataclass(frozen=True, slots=True)
+class Candidates:
+    """What may be the robot in one frame: px (N, 2), sigma_px (N,), box (N, 4), as in Sightings."""
+
+    t_ns: int
+    px: FloatArray
+    sigma_px: FloatArray
+    box: FloatArray
+
+    @classmethod
+    def of(cls, t_ns: int, image_px: ArrayLike, sigma_px: ArrayLike, box_px: ArrayLike | None) -> Candidates:
+        """From what `CameraMapper.add_candidates` takes."""
+        px = np.asarray(image_px, dtype=np.float64).reshape(-1, 2)
+        sigma = np.broadcast_to(np.asarray(sigma_px, dtype=np.float64), (len(px),)).copy()
+        box = np.full((len(px), 4), np.nan) if box_px is None else np.asarray(box_px, dtype=np.float64)
+        return cls(t_ns, px, sigma, box.reshape(-1, 4))
+
+
+def sightings_of(frames: Sequence[Candidates], origin_ns: int) -> Sightings:
+    """The candidates of frames, one after the other; times from `origin_ns` on."""
+    counts = [len(frame.px) for frame in frames]
+    box = np.concatenate([np.empty((0, 4)), *(frame.box for frame in frames)])
+    return Sightings(
+        np.repeat(np.arange(len(frames)), counts),
+        np.repeat(np.array([1e-9 * (frame.t_ns - origin_ns) for frame in frames]), counts),
+        np.concatenate([np.empty((0, 2)), *(frame.px for frame in frames)]),
+        np.concatenate([np.empty(0), *(frame.sigma_px for frame in frames)]),
+        box if np.isfinite(box).any() else None,
+    )
 
 
 @dataclass(frozen=True, slots=True)

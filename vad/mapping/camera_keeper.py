@@ -13,12 +13,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vad.geometry import FloatArray, Intrinsics
-from vad.mapping.camera_calibration import CameraCalibration
-from vad.mapping.camera_consensus import Sightings, consensus
+from vad.geometry import Intrinsics
+from vad.mapping.camera_calibration import CameraCalibration, Deviations
+from vad.mapping.camera_consensus import Candidates, consensus, sightings_of
+from vad.mapping.camera_contact import recontacted
 from vad.mapping.camera_fit import Start, surprise
 from vad.mapping.camera_spread import best_of_each
-from vad.mapping.camera_stage import CameraMapper, Deviations
+from vad.mapping.camera_stage import CameraMapper
 from vad.mapping.camera_track import PoseTrack
 from vad.mapping.camera_view import CameraView
 
@@ -71,7 +72,7 @@ class CameraKeeper:
         self._moved = ""
         self._lost_since_ns: int | None = None
         self._poses: deque[tuple[int, float, float, float]] = deque()
-        self._frames: deque[tuple[int, FloatArray, FloatArray]] = deque()
+        self._frames: deque[Candidates] = deque()
 
     def add_pose(self, t_ns: int, x_m: float, y_m: float, sigma_m: float) -> None:
         """One robot pose, map frame, at its own stamp."""
@@ -80,15 +81,16 @@ class CameraKeeper:
             self._poses.popleft()
         self._mapper.add_pose(t_ns, x_m, y_m, sigma_m)
 
-    def add_candidates(self, t_ns: int, image_px: ArrayLike, sigma_px: ArrayLike) -> None:
-        """What may be the robot in one frame while it drives: (N, 2) raw pixels, sigma scalar or (N,)."""
-        px = np.asarray(image_px, dtype=np.float64).reshape(-1, 2)
-        sigma = np.broadcast_to(np.asarray(sigma_px, dtype=np.float64), (len(px),)).copy()
-        if len(px):
-            self._frames.append((t_ns, px, sigma))
-        while self._frames and t_ns - self._frames[0][0] > _WINDOW_NS:
+    def add_candidates(
+        self, t_ns: int, image_px: ArrayLike, sigma_px: ArrayLike, box_px: ArrayLike | None = None
+    ) -> None:
+        """What may be the robot in one frame while it drives; see CameraMapper.add_candidates."""
+        frame = Candidates.of(t_ns, image_px, sigma_px, box_px)
+        if len(frame.px):
+            self._frames.append(frame)
+        while self._frames and t_ns - self._frames[0].t_ns > _WINDOW_NS:
             self._frames.popleft()
-        self._mapper.add_candidates(t_ns, px, sigma)
+        self._mapper.add_candidates(t_ns, frame.px, frame.sigma_px, frame.box)
 
     def look(self, t_ns: int, image: NDArray[np.uint8]) -> bool:
         """Compare the background with the one that belongs to the calibration; True when it was moved.
@@ -175,14 +177,8 @@ class CameraKeeper:
         origin_ns = self._poses[0][0]
         table = np.array([(1e-9 * (t - origin_ns), x, y, s) for t, x, y, s in self._poses])
         track = PoseTrack(table[:, 0], table[:, 1:3], table[:, 3])
-        counts = [len(px) for _, px, _ in self._frames]
-        sightings = Sightings(
-            np.repeat(np.arange(len(counts)), counts),
-            np.repeat([1e-9 * (t - origin_ns) for t, _, _ in self._frames], counts),
-            np.concatenate([px for _, px, _ in self._frames]),
-            np.concatenate([sigma for _, _, sigma in self._frames]),
-        )
         at = Start(known.intrinsics, known.camera_from_map, known.time_offset_s)
+        sightings = recontacted(sightings_of(self._frames, origin_ns), at)
         expected = np.unique(
             sightings.frame[np.isfinite(track.at(sightings.t_s + at.time_offset_s)[0][:, 0])]
         )

@@ -8,21 +8,24 @@ candidates and poses names the robot, finds the time offset and calibrates the c
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vad.geometry import FloatArray, Intrinsics, apply_homography, floor_homography, undistort
-from vad.mapping.camera_calibration import PARAMETERS, CameraCalibration, CameraStatus
+from vad.mapping.camera_calibration import PARAMETERS, CameraCalibration, CameraStatus, Deviations
 from vad.mapping.camera_consensus import (
     CONSENSUS_M,
+    Candidates,
     Consensus,
     Sightings,
     consensus,
     search_time_offset,
+    sightings_of,
 )
+from vad.mapping.camera_contact import recontacted
 from vad.mapping.camera_fit import (
     OFFSET,
     Fit,
@@ -54,6 +57,7 @@ _SEARCH_FRAMES = 80
 _KEPT_FRAMES = 6000
 _KEPT_POSES = 60_000
 _ROUNDS = 4
+_CONTACT_ROUNDS = 2
 # A pair this many standard deviations off is something else.
 _MAX_SURPRISE = 4.0
 # A stretch of the drive after the robot found itself anew joins the rest where so many frames agree.
@@ -64,19 +68,6 @@ _RIVAL_MARGIN = 40.0
 # The pose must be known this long around a pair, for its derivative in time.
 _TIME_MARGIN_S = 0.25
 _MOVING_M_S = 0.05
-
-
-@dataclass(frozen=True, slots=True)
-class Deviations:
-    """Robot against camera. robot_m, camera_m: (N, 2) floor points, map frame; image_px: (N, 2) where it was
-    found, raw; agreeing: share of the pictures that should show the robot in which it was found where it
-    should be; path_m: (M, 2) all of the robot's path."""
-
-    robot_m: FloatArray
-    camera_m: FloatArray
-    image_px: FloatArray
-    agreeing: float
-    path_m: FloatArray
 
 
 class CameraMapper:
@@ -100,18 +91,24 @@ class CameraMapper:
         )
         self._lens_known = intrinsics is not None
         self._poses: deque[tuple[int, float, float, float]] = deque(maxlen=_KEPT_POSES)
-        self._frames: deque[tuple[int, FloatArray, FloatArray]] = deque(maxlen=_KEPT_FRAMES)
+        self._frames: deque[Candidates] = deque(maxlen=_KEPT_FRAMES)
 
     def add_pose(self, t_ns: int, x_m: float, y_m: float, sigma_m: float) -> None:
         """One robot pose, map frame, at its own stamp."""
         self._poses.append((t_ns, x_m, y_m, sigma_m))
 
-    def add_candidates(self, t_ns: int, image_px: ArrayLike, sigma_px: ArrayLike) -> None:
-        """What may be the robot in one frame: (N, 2) floor contacts in raw pixels, sigma scalar or (N,)."""
-        px = np.asarray(image_px, dtype=np.float64).reshape(-1, 2)
-        if len(px):
-            sigma = np.broadcast_to(np.asarray(sigma_px, dtype=np.float64), (len(px),))
-            self._frames.append((t_ns, px, sigma.copy()))
+    def add_candidates(
+        self, t_ns: int, image_px: ArrayLike, sigma_px: ArrayLike, box_px: ArrayLike | None = None
+    ) -> None:
+        """What may be the robot in one frame.
+
+        Args:
+            image_px: (N, 2) floor contacts, raw pixels. sigma_px: scalar or (N,). box_px: (N, 4) where a
+                contact was made from a box with an assumed height of the robot, raw pixels, NaN for others.
+        """
+        frame = Candidates.of(t_ns, image_px, sigma_px, box_px)
+        if len(frame.px):
+            self._frames.append(frame)
 
     def solve(self) -> CameraCalibration:
         """The best calibration from what was collected, or what is missing. Under 0.5 s."""
@@ -133,7 +130,7 @@ class CameraMapper:
         fit = self._fit(sightings, track)
         if fit is None:
             return _no_consensus(frames, 0)
-        return self._judge(*fit, track)
+        return self._judge(*self._with_contacts(*fit, track), track)
 
     def deviations(self, known: CameraCalibration) -> Deviations | None:
         """What was collected against a calibration that is not changed by it; None if it has no place."""
@@ -145,6 +142,7 @@ class CameraMapper:
         if not len(sightings.frame):
             return None
         at = Start(lens, pose, offset_s)
+        sightings = recontacted(sightings, at)
         pairs = sightings.take(self._named(at, sightings, track))
         xy, _ = track.at(pairs.t_s + offset_s)
         found, _ = known.floor_point(pairs.image_px, pairs.sigma_px)
@@ -159,18 +157,10 @@ class CameraMapper:
 
     def _chosen(self, track: PoseTrack, origin_ns: int) -> Sightings:
         """At most SOLVE_FRAMES frames, spread evenly over the floor that was driven."""
-        frame_s = np.array([1e-9 * (t - origin_ns) for t, _, _ in self._frames])
+        frame_s = np.array([1e-9 * (frame.t_ns - origin_ns) for frame in self._frames])
         xy, _ = track.at(frame_s)
         rows = spread_selection(xy, SOLVE_FRAMES)
-        chosen = [self._frames[row] for row in rows]
-        counts = [len(px) for _, px, _ in chosen]
-        empty = np.empty((0, 2))
-        return Sightings(
-            np.repeat(np.arange(len(rows)), counts),
-            np.repeat(frame_s[rows], counts),
-            np.concatenate([empty, *(px for _, px, _ in chosen)]),
-            np.concatenate([empty[:, 0], *(sigma for _, _, sigma in chosen)]),
-        )
+        return sightings_of([self._frames[row] for row in rows], origin_ns)
 
     def _fit(self, sightings: Sightings, track: PoseTrack) -> tuple[Fit, Sightings, Sightings] | None:
         """The fit, its pairs, and the sightings it speaks of: those under one belief of the robot."""
@@ -220,6 +210,20 @@ class CameraMapper:
         alike = [other for misfit, other, _ in solved if misfit < cost + _RIVAL_MARGIN]
         apart = [apart_m(fit.at, other.at, pairs.image_px) for other in alike]
         return replace(fit, rival_m=max(apart)), pairs
+
+    def _with_contacts(
+        self, fit: Fit, pairs: Sightings, sightings: Sightings, track: PoseTrack
+    ) -> tuple[Fit, Sightings, Sightings]:
+        """The fit again, with the contacts of boxes as they are seen from where the camera is now known."""
+        free = free_parameters(lens_known=self._lens_known)
+        for _ in range(0 if sightings.box is None else _CONTACT_ROUNDS):
+            seen = recontacted(sightings, fit.at)
+            named = seen.take(self._named(fit.at, seen, track))
+            again = refine(fit.at, named, track, free=free) if len(named.frame) >= MIN_PAIRS else None
+            if again is None:
+                break
+            fit, pairs, sightings = replace(again, rival_m=fit.rival_m), named, seen
+        return fit, pairs, sightings
 
     def _misfit(self, at: Start, sightings: Sightings, track: PoseTrack) -> float:
         """How badly a camera explains all frames: squared surprise of the best of each, cut off."""

@@ -44,11 +44,12 @@ class Poses(NamedTuple):
 
 
 class Candidates(NamedTuple):
-    """What moves in one frame: t_s; px (K, 2) raw pixels; sigma_px (K,)."""
+    """What moves in one frame: t_s; px (K, 2) raw pixels; sigma_px (K,); box (K, 4) if there is one."""
 
     t_s: float
     px: FloatArray
     sigma_px: FloatArray
+    box: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True)

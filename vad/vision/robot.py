@@ -41,13 +41,15 @@ class RobotCandidate:
     """Something that moves and may be the robot.
 
     x_px, y_px: the middle of its contact with the floor, raw pixels; sigma_px: 1 standard deviation per axis;
-    box: (x0, y0, x1, y1) of the blob, raw pixels.
+    box: (x0, y0, x1, y1) of the blob, raw pixels; from_box: the contact follows from the box alone, with a
+    usual height of the robot.
     """
 
     x_px: float
     y_px: float
     sigma_px: float
     box: tuple[float, float, float, float]
+    from_box: bool = True
 
 
 class CandidateFinder(Protocol):

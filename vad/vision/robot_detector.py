@@ -109,7 +109,7 @@ class RobotDetector:
                 continue
             x_px, y_px = disc_contact(*box) if found.contacts is None else found.contacts[k].tolist()
             sigma_px = float(np.hypot(_SIGMA_PX, _SIGMA_PER_WIDTH * (x1 - x0)))
-            candidates.append(RobotCandidate(x_px, y_px, sigma_px, box))
+            candidates.append(RobotCandidate(x_px, y_px, sigma_px, box, found.contacts is None))
         return candidates[:MAX_CANDIDATES]
 
     def detect(self, image: Image, threshold: float) -> Detections:
