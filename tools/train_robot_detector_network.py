@@ -124,7 +124,8 @@ class Head(nn.Module):
 
 
 class Detector(nn.Module):
-    """What is exported: uint8 BGR (1, H, W, 3), sides multiples of 16 -> (1, 7, H/8, W/8).
+    """What is exported: uint8 BGR (1, H, W, 3), sides multiples of 16 -> (1, 7, H/8, W/8), the mean of
+    what is seen in the picture and in its mirror image.
 
     Channels: heat 0..1; in input pixels: middle x and y, width, height, floor contact x and y.
     """
@@ -134,7 +135,11 @@ class Detector(nn.Module):
         self.backbone, self.head = backbone, head
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
-        heat, box = self.head(self.backbone(image))
+        heat, box = self.head(self.backbone(torch.cat([image, image.flip(2)])))
+        # What is seen in the mirror, too, is better founded; offsets along x change their sign there.
+        sign = torch.tensor([-1.0, 1.0, 1.0, 1.0, -1.0, 1.0]).reshape(1, 6, 1, 1)
+        heat = (heat[0:1] + heat[1:2].flip(3)) / 2
+        box = (box[0:1] + box[1:2].flip(3) * sign) / 2
         ones = torch.ones_like(heat)
         cell = torch.cat([torch.cumsum(ones, 3), torch.cumsum(ones, 2)], 1) - 0.5
         middle, contact = ((cell + offset) * STRIDE - 0.5 for offset in (box[:, 0:2], box[:, 4:6]))
