@@ -25,7 +25,7 @@ from vad.mapping.evidence import Terms
 from vad.mapping.paper import THRESHOLD_OFFICE_M, THRESHOLD_OPEN_SPACE_M
 from vad.mapping.posterior import Bounds, Grid, Posterior
 from vad.robot.floor_plan import FloorPlan
-from vad.solve import on_plan
+from vad.solve import on_plan, plan_prior
 
 FloatArray = NDArray[np.float64]
 
@@ -133,7 +133,7 @@ def fuse(name: str, cases: Sequence[Case], evidence: Sequence[Evidence]) -> Scor
 def _score(name: str, cases: Sequence[Case], posterior: Posterior, status: str) -> Score:
     first = cases[0]
     if first.plan is not None:
-        posterior = on_plan(posterior, first.plan)
+        posterior = on_plan(posterior, plan_prior(first.plan, posterior.grid))
     place = place_from_posterior(posterior)
     off_m = place.xy_m - first.truth_m
     middle = np.mean([c.recording.walk.xy_m.mean(axis=0) for c in cases], axis=0)

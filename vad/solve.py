@@ -159,10 +159,13 @@ def fuse(solved: Sequence[Solved]) -> list[Fused]:
     return results
 
 
-def on_plan(posterior: Posterior, plan: FloorPlan) -> Posterior:
-    """The posterior of all walks with what the floor plan says of where devices are; to be used once."""
-    fine = Grid.over(posterior.grid.bounds_m, PLAN_STEP_M)
+def plan_prior(plan: FloorPlan, grid: Grid) -> FloatArray:
+    """What the floor plan says of where devices are: log-density (rows, columns) of the grid."""
+    fine = Grid.over(grid.bounds_m, PLAN_STEP_M)
     cells = plan.occupancy_at(fine.points_m).reshape(fine.rows, fine.columns)
-    free = (cells >= FREE) & (cells < OCCUPIED / 2)
-    prior = plan_log_prior(free, fine, posterior.grid)
+    return plan_log_prior((cells >= FREE) & (cells < OCCUPIED / 2), fine, grid)
+
+
+def on_plan(posterior: Posterior, prior: FloatArray) -> Posterior:
+    """The posterior of all walks with `plan_prior`; to be used once."""
     return Posterior(posterior.grid, posterior.log_density + prior)

@@ -7,7 +7,7 @@ import numpy as np
 from vad.mapping.plan_prior import OPEN_FLOOR_NATS, OUTSIDE_NATS, plan_log_prior
 from vad.mapping.posterior import Grid, Posterior
 from vad.robot.floor_plan import FREE, OCCUPIED, UNKNOWN, FloorPlan
-from vad.solve import on_plan
+from vad.solve import on_plan, plan_prior
 
 FINE = Grid.over((0.0, 0.0, 8.0, 6.0), 0.05)
 GRID = Grid.over((0.0, 0.0, 8.0, 6.0), 0.1)
@@ -42,9 +42,10 @@ def test_a_region_half_outside_is_drawn_into_the_home() -> None:
     cells[20:100, 20:140] = FREE
     cells[20:100, 138:140] = OCCUPIED
     plan = FloorPlan(1, 0.05, (0.0, 0.0, 0.0), cells)
+    prior = plan_prior(plan, GRID)
     off = GRID.points_m - np.array([7.3, 3.0])
     wide = Posterior(GRID, (-0.5 * (off**2).sum(axis=1)).reshape(GRID.rows, GRID.columns))
-    before, after = wide.mean_and_covariance()[0], on_plan(wide, plan).mean_and_covariance()[0]
+    before, after = wide.mean_and_covariance()[0], on_plan(wide, prior).mean_and_covariance()[0]
     assert after[0] < before[0]
     sharp = Posterior(GRID, (-0.5 * (off**2).sum(axis=1) / 0.1**2).reshape(GRID.rows, GRID.columns))
-    assert np.linalg.norm(on_plan(sharp, plan).mean_and_covariance()[0] - [7.3, 3.0]) < 0.05
+    assert np.linalg.norm(on_plan(sharp, prior).mean_and_covariance()[0] - [7.3, 3.0]) < 0.05

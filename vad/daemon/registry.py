@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vad.bus import messages as m
 from vad.bus.node import Bus, now_rfc3339
@@ -26,7 +27,7 @@ from vad.mapping.plan_match import IDENTITY, PlanTransform
 from vad.mapping.posterior import Grid, Posterior
 from vad.mapping.reanchor import moved_posterior
 from vad.robot.floor_plan import FloorPlan
-from vad.solve import on_plan
+from vad.solve import on_plan, plan_prior
 from vad.store.records import DeviceRecord, Estimate, PosteriorRecord
 from vad.store.worker import StoreWorker
 
@@ -43,6 +44,7 @@ class Registry:
     def __init__(self, settings: Settings, plan: FloorPlan, bus: Bus, store: StoreWorker) -> None:
         self._settings = settings
         self._plan = plan
+        self._priors: dict[Grid, NDArray[np.float64]] = {}  # of the present plan
         self._bus = bus
         self._store = store
         self._devices: dict[str, DeviceRecord] = {}
@@ -196,6 +198,7 @@ class Registry:
         stale for `reason`.
         """
         before, self._plan = self._plan, plan
+        self._priors.clear()
         for record in self.all():
             if record.epoch != before.epoch:
                 continue
@@ -279,7 +282,9 @@ class Registry:
 
     def _joint(self, total: Posterior, walks: int) -> Posterior:
         """All walks and the floor plan together, from the product of `walks` walks."""
-        return on_plan(joint_posterior(total, walks), self._plan)
+        if total.grid not in self._priors:
+            self._priors[total.grid] = plan_prior(self._plan, total.grid)
+        return on_plan(joint_posterior(total, walks), self._priors[total.grid])
 
     async def would_be_mapped(self, mac: str, evidence: Posterior) -> bool:
         """Whether this much of a walk would make the device a mapped one."""
