@@ -46,11 +46,15 @@ async def until(condition: Callable[[], bool], what: str, timeout_s: float = 15.
 
 
 class Card:
-    """A 5300's driver that writes into a FIFO: 3x2 packets, numbered by their bfee_count."""
+    """A 5300's driver that writes a log: 3x2 packets, numbered by their bfee_count.
 
-    def __init__(self, path: Path) -> None:
+    Into a FIFO, as the CSI Tool would; or into a file that grows and has patience with a busy machine.
+    """
+
+    def __init__(self, path: Path, *, patient: bool = False) -> None:
         self.sent = 0
-        self._sender = FifoSender(path)
+        self._sender = None if patient else FifoSender(path)
+        self._file = path.open("wb", buffering=0) if patient else None
 
     def send(self, n: int) -> None:
         """The next n packets, which came in the last n times 0.2 ms."""
@@ -58,14 +62,21 @@ class Card:
         csi = np.ones((n, 30, 3, 2, 2), np.int8)
         nic_us = time.monotonic_ns() // 1000 - 200 * np.arange(n)[::-1]
         bodies = encode_bodies(csi, nic_us=nic_us, bfee_count=count, rssi=(30, 31, 32))
-        before = self._sender.health.counters["records"]
-        self._sender.send([record(BFEE, body) for body in bodies])
-        assert self._sender.health.counters["records"] - before == n, "the FIFO has a reader that keeps up"
+        records = [record(BFEE, body) for body in bodies]
+        if self._file is not None:
+            self._file.write(b"".join(records))
+        if self._sender is not None:
+            before = self._sender.health.counters["records"]
+            self._sender.send(records)
+            assert self._sender.health.counters["records"] - before == n, "the FIFO's reader keeps up"
         self.sent += n
 
     def close(self) -> None:
-        """Take the FIFO away."""
-        self._sender.close()
+        """Take the FIFO away; the file stays."""
+        if self._sender is not None:
+            self._sender.close()
+        if self._file is not None:
+            self._file.close()
 
 
 @contextlib.contextmanager

