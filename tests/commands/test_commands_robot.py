@@ -278,6 +278,8 @@ def test_export_writes_what_the_daemon_uses(tmp_path: Path, floor: dict[str, str
 def test_every_example_of_a_robot_can_be_used() -> None:
     kinds = {}
     for path in sorted(CONFIG.glob("*.yaml")):
+        if path.stem == "agent":
+            continue  # of another program: vad agent
         kinds[path.stem] = type(load_settings(path).robot).__name__
     assert kinds.items() >= {
         ("neato-usb", "NeatoRobot"),
