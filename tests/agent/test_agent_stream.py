@@ -7,7 +7,7 @@ from collections import deque
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from vad.agent.frames import (
@@ -155,6 +155,7 @@ courses = st.lists(steps, max_size=80)
 
 
 @given(courses, st.integers(2_000, 60_000))
+@example([(0, 0, 2, False), (3, 0, 1, False), (1, 0, 1, False)], 2000)
 @settings(max_examples=200)
 def test_every_packet_arrives_once_and_in_order_or_is_counted(
     course: list[tuple[int, int, int, bool]], limit_bytes: int

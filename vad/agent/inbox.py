@@ -23,6 +23,7 @@ class Inbox:
         self._former: deque[int] = deque(maxlen=_REMEMBERED_STREAMS)
         self._next_seq = 0
         self._expected: int | None = None  # packets before the next frame; None where a stream begins
+        self._given_up = 0  # packets before the first frame, by all that has been heard of them
 
     @property
     def ack(self) -> Ack | None:
@@ -33,6 +34,7 @@ class Inbox:
         """True where the frame is the next one."""
         if frame.stream != self._stream and not self._begin(frame):
             return False
+        self._given_up = max(self._given_up, frame.given_up)
         if frame.seq < self._next_seq:
             self.repeated += 1
             return False
@@ -42,7 +44,7 @@ class Inbox:
             self.early += 1
             return False
         # What came before the first frame this run of the hub sees, an earlier run may have.
-        missing = frame.given_up if self._expected is None else frame.before - self._expected
+        missing = self._given_up if self._expected is None else frame.before - self._expected
         self.lost += max(0, missing)
         self._next_seq = frame.seq + 1
         self._expected = frame.before + frame.packets
@@ -59,4 +61,5 @@ class Inbox:
         self.streams += 1
         self._next_seq = frame.oldest
         self._expected = None
+        self._given_up = 0
         return True
