@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     for file in (Path(__file__).parent / "cameras").iterdir():
         if file.is_file():
             shutil.copy(file, folder)
+    subprocess.run([sys.executable, str(folder / "pictures.py"), str(folder)], check=True)
     command = [str(ROOT / "tools" / "guest" / "run"), str(folder)]
     limit = {**os.environ, "VAD_GUEST_TIMEOUT_S": "1200"}
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=limit)

@@ -28,7 +28,7 @@ _TRANSFER_BYTES = 1 << 20
 _READ_TIMEOUT_MS = 500
 _COMMAND_TIMEOUT_MS = 1000
 _SILENT_READS = 8
-_END_S = 6.0
+_END_S = 8.0
 _READY_POLLS, _READY_POLL_S = 100, 0.1
 _STALE_READS, _STALE_TIMEOUT_MS = 16, 20
 # The decoder works on one picture, this many wait; older ones go.
@@ -159,6 +159,8 @@ class _Link:
         self._suspend(False)
         self._forget()
         for command in kinect2.OPENING:
+            if stop.is_set():
+                return
             answer = self._ask(command)
             if command is kinect2.SERIAL:
                 self.serial = kinect2.serial_number(answer)

@@ -23,9 +23,7 @@ from vad.streams import DropOldestQueue
 # The thread ends within one frame or this; OpenCV's own 10 s would hold up the end of the daemon.
 _SELECT_TIMEOUT_S = 1
 _SELECT_TIMEOUT_VARIABLE = "OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT"
-# Whether the driver's stamps are on the timeline shows in the first picture; on a busy machine later ones may
-# wait in the driver's buffers for longer, and their stamps are right all the same.
-_OLDEST_FIRST_NS = 2_000_000_000
+# Of a trusted driver: on a busy machine its pictures may wait in its buffers for as long as this.
 _OLDEST_TRUSTED_NS = 30_000_000_000
 
 
@@ -93,22 +91,38 @@ class V4l2Camera:
             capture.set(cv2.CAP_PROP_FRAME_WIDTH, wanted.width_px)
             capture.set(cv2.CAP_PROP_FRAME_HEIGHT, wanted.height_px)
             capture.set(cv2.CAP_PROP_FPS, wanted.fps)
-            fourcc, oldest_ns = _format(capture), _OLDEST_FIRST_NS
+            fourcc, stamps, last_ns = _format(capture), _DriverClock(), 0
             while not stop.is_set():
                 good, image = capture.read()
                 arrival_ns = time.monotonic_ns()
                 if not good or image is None:
                     raise SourceError("the camera has stopped sending", where=wanted.device)
                 driver_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
-                trusted = driver_ns > 0 and is_plausible(driver_ns, arrival_ns, oldest_ns)
-                oldest_ns = _OLDEST_TRUSTED_NS if trusted else _OLDEST_FIRST_NS
-                t_ns = min(driver_ns, arrival_ns) if trusted else arrival_ns
+                t_ns, trusted = stamps.stamp(driver_ns, arrival_ns)
+                if t_ns <= last_ns:  # the clocks were mixed for a moment; time does not go back
+                    continue
+                last_ns = t_ns
                 picture = np.asarray(image, dtype=np.uint8)
                 height, width = picture.shape[:2]
                 detail = f"{width}x{height} {fourcc}, stamps: {'driver' if trusted else 'arrival'}"
                 emit(Shot(t_ns, picture, detail, {"arrival_stamps": not trusted}))
         finally:
             capture.release()
+
+
+class _DriverClock:
+    """Whether a driver's stamps are on the timeline: its first one tells, for as long as it is open."""
+
+    def __init__(self) -> None:
+        self._trusted: bool | None = None
+
+    def stamp(self, driver_ns: int, arrival_ns: int) -> tuple[int, bool]:
+        """The picture's time on the timeline, and whether it is the driver's."""
+        if self._trusted is None and driver_ns > 0:
+            self._trusted = is_plausible(driver_ns, arrival_ns)
+        if self._trusted and driver_ns > 0 and is_plausible(driver_ns, arrival_ns, _OLDEST_TRUSTED_NS):
+            return min(driver_ns, arrival_ns), True
+        return arrival_ns, False
 
 
 def _format(capture: Capture) -> str:

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import json
 import sys
+from pathlib import Path
 
 from kinect import Kinect
-from pictures import jpegs
 from uvc import UvcCamera
 
 FPS = 10.0
 
 
 def main() -> None:
-    uvc = sys.argv[1] == "uvc"
-    stored = jpegs(640, 480) if uvc else jpegs(1920, 1080)[:64]
+    kind = sys.argv[1]
+    stored = [path.read_bytes() for path in sorted((Path(__file__).parent / kind).glob("*.jpg"))]
 
     def picture(k: int) -> bytes:
         return stored[k % len(stored)]
 
-    device = UvcCamera(picture, 640, 480, FPS) if uvc else Kinect(picture, FPS)
+    device = UvcCamera(picture, 640, 480, FPS) if kind == "uvc" else Kinect(picture, FPS)
     sys.stdout.write("{}\n")
     sys.stdout.flush()
     for line in sys.stdin:
