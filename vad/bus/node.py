@@ -23,7 +23,7 @@ from zenoh import handlers
 
 from vad.bus import messages as m
 from vad.bus.answers import Answerer, Later, NoHistoryError, Past, Reply, answerers
-from vad.bus.board import PNG_ENCODING, Board, Entry, entry_of, raw_entry
+from vad.bus.board import PNG_ENCODING, Board, Entry, Form, entry_of, raw_entry
 from vad.bus.closing import close_in_time
 from vad.bus.keys import ANY, HubKeys
 from vad.bus.schemas import SCHEMA_ENCODING, json_schemas
@@ -39,6 +39,10 @@ KEPT_CAPTURES = 32
 """Captures a query still finds; older ones are forgotten."""
 MAX_LATER = 64
 """Questions about the past that may wait for the store at one time."""
+
+
+Listener = Callable[[str, Form | None], None]
+"""Hears of each change of what is published: the key, and the value as sent; None where it is no more."""
 
 
 class BusyError(VadError):
@@ -67,6 +71,7 @@ class Bus:
         self._answerers = answerers(self._board, source)
         self._past: Past | None = None
         self._later: set[asyncio.Task[None]] = set()
+        self._listeners: list[Listener] = []
         self._asked_past = 0
         for name, text in json_schemas().items():
             self._board.put(
@@ -121,6 +126,17 @@ class Bus:
     def ask_past(self, past: Past | None) -> None:
         """From now on questions about the past (`?at=`, history) go to `past`."""
         self._past = past
+
+    def listen(self, listener: Listener) -> Callable[[], None]:
+        """Tell `listener` all that is known, then every change and event; what this returns ends it.
+
+        It is called on the event loop, in the midst of publishing: it keeps what it hears and returns.
+        """
+        self._listeners.append(listener)
+        for table in self._board.tables.values():
+            for key, entry in table.items():
+                listener(key, entry.form)
+        return partial(self._listeners.remove, listener)
 
     @property
     def status(self) -> m.StatusMessage | None:
@@ -177,7 +193,10 @@ class Bus:
             (self.keys.device(), self.keys.device(mac)),
             (self.keys.heatmap(), self.keys.heatmap(mac)),
         ):
-            if self._board.drop(pattern, key) and self._session is not None:
+            if not self._board.drop(pattern, key):
+                continue
+            self._tell(key, None)
+            if self._session is not None:
                 self._guard(partial(self._session.delete, key))
 
     def _publish(self, pattern: str, key: str, message: m.Message) -> None:
@@ -185,7 +204,12 @@ class Bus:
         if self._board.put(pattern, entry):
             self._put(entry)
 
+    def _tell(self, key: str, form: Form | None) -> None:
+        for listener in self._listeners:
+            listener(key, form)
+
     def _put(self, entry: Entry) -> None:
+        self._tell(str(entry.key), entry.form)
         if self._session is None:
             return
         put = partial(
