@@ -8,6 +8,7 @@ from vad import __version__
 from vad.commands import loading
 from vad.commands.agent import agent
 from vad.commands.camera import app as camera_app
+from vad.commands.config import config_app
 from vad.commands.csi import csi_app
 from vad.commands.demo import demo
 from vad.commands.device import device_app
@@ -49,6 +50,7 @@ def _vad(
 
 app.command()(run)
 app.command("check-config")(check_config)
+app.add_typer(config_app, name="config")
 app.command()(agent)
 app.command()(devices)
 app.add_typer(device_app, name="device")

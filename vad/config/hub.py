@@ -15,41 +15,55 @@ from vad.config.robot import RobotSettings
 
 
 class MapSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The floor plan. file: a map_server YAML beside its picture; left out: the robot's own map.
+    """The floor plan.
 
-    epoch: of the file; raise it when the map changes. rooms: a YAML with `rooms: [{name, polygon_m}]`, for
-    maps that have none.
+    file: a map_server YAML beside its picture; left out: the robot's own map
+    epoch: of the file; raise it when the map changes
+    rooms: for maps that have none: a YAML file, `rooms: [{name: Hall, polygon_m: [[0, 0], [3, 0], [3, 2]]}]`
     """
 
-    file: str | None = None
+    file: Annotated[str, Meta(examples=["floor.yaml"])] | None = None
     epoch: Annotated[int, Meta(ge=0)] = 1
-    rooms: str | None = None
+    rooms: Annotated[str, Meta(examples=["rooms.yaml"])] | None = None
 
 
 class BusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """zenoh. listen: tcp on the loopback interface and, for the network, tls (e.g. tls/0.0.0.0:7448) for who
-    has a certificate of `vad pki`; connect: other routers; pki: the folder of certificates, left out: `pki`
-    in state_dir."""
+    """zenoh: what the hub publishes and answers.
+
+    listen: tcp on the loopback interface and, for the network, tls (tls/0.0.0.0:7448) for who has a
+        certificate of `vad pki`
+    connect: other routers, e.g. tcp/127.0.0.1:7448
+    pki: the folder of certificates; left out: pki in state_dir
+    """
 
     listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
-    connect: tuple[str, ...] = ()
-    pki: str | None = None
+    connect: Annotated[tuple[str, ...], Meta(examples=[["tcp/127.0.0.1:7450"]])] = ()
+    pki: Annotated[str, Meta(examples=["/var/lib/vad/pki"])] | None = None
 
 
 class MetricsSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Prometheus metrics at http://127.0.0.1:<port>/metrics; left out: none."""
+    """Metrics for Prometheus on the loopback interface.
 
-    port: Annotated[int, Meta(ge=1, le=65535)] | None = None
+    port: of http://127.0.0.1:<port>/metrics; left out: none
+    """
+
+    port: Annotated[int, Meta(ge=1, le=65535, examples=[9747])] | None = None
 
 
 class CaptureSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """When a device counts as mapped, who is measured, how long a capture may be, what is kept.
 
-    mapped_radius_m: 90 % region at which measuring stops; min_walks: at least as many walks. together: how
-    many devices one walk may measure. recheck_h: a mapped device is measured again after so many hours: was
-    it moved? 0 = never. airtime_percent: what provoked packets may take of the channel's time,
-    averaged over an hour. quota_mb: session folders together, the oldest go first; keep_free_mb: what they
-    leave free on their disk. keep_frames: the walk's pictures, too (people are on them).
+    mapped_radius_m: measuring stops when the 90 % region's radius is this small ...
+    min_walks: ... after at least so many walks
+    max_walks: after so many it counts as mapped if its room is sure, else as failed
+    min_s: shortest walk that is used
+    max_s: longest capture
+    together: how many devices one walk may measure
+    recheck_h: a mapped device is measured again after so long: was it moved? 0 = never
+    airtime_percent: what provoked packets may take of the channel's time, averaged over an hour
+    quota_mb: session folders together; the oldest go first
+    keep_free_mb: what they leave free on their disk
+    keep_frames: keep the walk's pictures, too (people are on them)
     """
 
     mapped_radius_m: Positive = 0.7
@@ -66,25 +80,30 @@ class CaptureSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
 
 
 class VisionSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """People and the robot in the picture. model: a MoveNet or YOLO-pose ONNX file, else the packaged one.
+    """People and the robot in the picture.
 
-    robot_detector: `motion` finds the robot by its driving, `packaged` by the network that comes along, a
-    path by a YOLOv5, YOLOv8 or YOLOX ONNX file; robot_class: its class there, by name or number, if it has
-    several.
+    model: pose network, MoveNet (Multi- or SinglePose) or YOLO-pose as ONNX; left out: the packaged one
+    robot_detector: motion finds the robot by its driving, packaged by the network that comes along, a path
+        by a YOLOv5, YOLOv8 or YOLOX as ONNX
+    robot_class: its class there, by name or number, if it has several
+    max_fps: pictures a second that are looked at; one walker at 15 takes 40 % of a core, an idle room 3 %
+    threads: of the network
     """
 
-    model: str | None = None
+    model: Annotated[str, Meta(examples=["yolo11n-pose.onnx"])] | None = None
     robot_detector: str = "motion"
-    robot_class: str | None = None
+    robot_class: Annotated[str, Meta(examples=["robot vacuum"])] | None = None
     max_fps: Positive = 15.0
     threads: Annotated[int, Meta(ge=1, le=16)] = 1
 
 
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """vad.yaml.
+    """vad.yaml: the settings of the daemon.
 
-    hub: the name in every zenoh key; source: `simulated` marks every message of a simulated home;
-    state_dir: database and session folders.
+    robot: the robot vacuum, which knows where it is
+    hub: the name in every zenoh key: vad/home/...
+    source: `simulated` marks every message of a simulated home
+    state_dir: database and recorded sessions
     """
 
     robot: RobotSettings

@@ -11,24 +11,35 @@ from vad.config.kinds import MacText, Positive
 
 
 class ConnectorCsi(msgspec.Struct, tag="connector", frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Intel 5300 over netlink. group: 26 on every kernel since 2.6.3x; allow_user_space: take packets that do
-    not come from the kernel (emulators only)."""
+    """Intel 5300 with the Linux 802.11n CSI Tool, over netlink.
+
+    group: of the netlink connector; 26 on every kernel since 2.6.3x
+    allow_user_space: take packets, too, that do not come from the kernel (emulators only)
+    """
 
     group: Annotated[int, Meta(ge=1, le=1000)] = 26
     allow_user_space: bool = False
 
 
 class FollowCsi(msgspec.Struct, tag="follow", frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A CSI log that another program writes: a FIFO or a growing file in log_to_file's format."""
+    """A CSI log that another program writes: a FIFO or a growing file in log_to_file's format.
 
-    path: str
+    path: of the FIFO or file
+    """
+
+    path: Annotated[str, Meta(examples=["/run/csi/csi.fifo"])]
 
 
 class RadioSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The hub's CSI radio. antenna_offset_m: where its antennas are from the camera, along the map's axes.
+    """The hub's CSI radio.
 
-    transmitter: whose all packets are, where the card is no access point (client mode: the AP's address);
-    traffic_packets_per_s: echo requests to the device under measurement, if its IP is known; 0 = none.
+    source: where CSI comes from
+    transmitter: MAC of whom every packet is from, where the card is no access point (client mode: the access
+        point's)
+    traffic_packets_per_s: echo requests to the device under measurement, if its IP address is known; 0 = none
+    carrier_hz: centre of the Wi-Fi channel: 5.18e9 + 5e6 * (channel - 36), or 2.412e9 + 5e6 * (channel - 1)
+    bandwidth_mhz: of the Wi-Fi channel
+    antenna_offset_m: where its antennas are from the camera, along the map's x, y, z
     """
 
     source: ConnectorCsi | FollowCsi = ConnectorCsi()

@@ -42,11 +42,19 @@ def parse_yaml(text: str, *, where: str) -> dict[str, Any]:
 
 
 def _typed(raw: dict[str, Any], kind: type[T], where: str) -> T:
+    # A section of which every line is a comment reads as null: everything in it is the default.
+    filled = {key: {} if value is None and _is_section(kind, key) else value for key, value in raw.items()}
     try:
-        return msgspec.convert(raw, type=kind, strict=False)  # YAML 1.1 reads 5.24e9 as text
+        return msgspec.convert(filled, type=kind, strict=False)  # YAML 1.1 reads 5.24e9 as text
     except msgspec.ValidationError as error:
         what, _, path = str(error).partition(" - at ")
         raise ConfigError(what, where=f"{where}: {path.strip('`') or '$'}") from error
+
+
+def _is_section(kind: type[Any], key: str) -> bool:
+    types = {field.encode_name: field.type for field in msgspec.structs.fields(kind)}
+    found = types.get(key)
+    return isinstance(found, type) and issubclass(found, msgspec.Struct)
 
 
 def _check_robot(settings: Settings, where: str) -> None:
