@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from functools import cache
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ from vad.vision.robot import RobotFinder, disc_contact
 LENS = Intrinsics(640, 480, 520.0, 520.0, 319.5, 239.5)
 CAMERA = look_at([1.2, -1.4, 2.1], [1.4, 1.4, 0.0])
 NOBODY = np.empty((0, 4))
+NOISE_MARGIN_PX = 128
 ANGLE = np.linspace(0.0, 2.0 * np.pi, 40)
 RING = np.column_stack([np.cos(ANGLE), np.sin(ANGLE), np.zeros(40)])
 
@@ -25,6 +27,12 @@ def floor_texture(seed: int = 0) -> NDArray[np.uint8]:
     rng = np.random.default_rng(seed)
     coarse = rng.uniform(90.0, 190.0, (12, 16, 3)).astype(np.float32)
     return cv2.resize(coarse, (640, 480), interpolation=cv2.INTER_CUBIC).clip(0, 255).astype(np.uint8)
+
+
+@cache
+def noise_field() -> NDArray[np.int16]:
+    shape = (480 + NOISE_MARGIN_PX, 640 + NOISE_MARGIN_PX, 3)
+    return np.round(np.random.default_rng(99).normal(0.0, 3.0, shape)).astype(np.int16)
 
 
 def render(
@@ -48,8 +56,10 @@ def render(
     if person_px is not None:
         x, y = person_px
         cv2.ellipse(image, (x, y), (35, 95), 0, 0, 360, (60, 40, 160), -1)
-    noisy = image.astype(np.float32) + rng.normal(0.0, 3.0, image.shape)
-    return noisy.clip(0, 255).astype(np.uint8)
+    # A window into a larger field, somewhere else in each frame: drawing all of it anew is slow.
+    dy, dx = rng.integers(0, NOISE_MARGIN_PX, 2)
+    noise = noise_field()[dy : dy + image.shape[0], dx : dx + image.shape[1]]
+    return np.asarray(cv2.add(image, noise, dtype=cv2.CV_8U), dtype=np.uint8)
 
 
 def contact_px(xy_m: tuple[float, float]) -> NDArray[np.float64]:
