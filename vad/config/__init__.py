@@ -22,6 +22,7 @@ from vad.config.hub import (
     VisionSettings,
 )
 from vad.config.kinds import AbsolutePath, Id, Ipv4Text, MacText, Positive
+from vad.config.mqtt import MqttSettings
 from vad.config.radio import ConnectorCsi, FollowCsi, RadioSettings
 from vad.config.reading import (
     agent_settings,
@@ -62,6 +63,7 @@ __all__ = [
     "MapSettings",
     "MetricsSettings",
     "MjpegCameraSettings",
+    "MqttSettings",
     "NeatoRobot",
     "Positive",
     "RadioSettings",

@@ -10,6 +10,7 @@ from msgspec import Meta
 from vad.config.camera import CameraSettings
 from vad.config.devices import DeviceSettings
 from vad.config.kinds import Id, Positive
+from vad.config.mqtt import MqttSettings
 from vad.config.radio import RadioSettings
 from vad.config.robot import RobotSettings
 
@@ -116,5 +117,6 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     state_dir: str = "/var/lib/vad"
     bus: BusSettings = BusSettings()
     metrics: MetricsSettings = MetricsSettings()
+    mqtt: MqttSettings = MqttSettings()
     capture: CaptureSettings = CaptureSettings()
     vision: VisionSettings = VisionSettings()

@@ -10,6 +10,7 @@ import zenoh
 from vad.agent.info import decode_info
 from vad.bus.gate import Gate, GateSettings
 from vad.bus.keys import HubKeys
+from vad.bus.node import Bus
 from vad.bus.session import local_endpoints, tls_endpoints
 from vad.camera.folder import FolderCamera, Recording
 from vad.camera.frame import CameraSource
@@ -41,6 +42,7 @@ from vad.devices.lease_source import LeaseSource
 from vad.devices.nl80211_source import Nl80211Source
 from vad.devices.static_list import StaticList
 from vad.devices.station import JoinSource
+from vad.homeassistant.link import HomeAssistant
 from vad.mac import mac_from_text
 from vad.pki.folder import PkiFolder
 from vad.robot.json_line_source import JsonLineSource
@@ -63,6 +65,14 @@ def network_gate(settings: Settings, config_file: Path) -> Gate | None:
         return None
     daemon = local_endpoints(settings.bus.listen)[0]
     return Gate(GateSettings(settings.hub, listen, daemon), PkiFolder(pki_folder(settings, config_file)))
+
+
+def home_assistant(settings: Settings, base: Path, state_dir: Path, bus: Bus) -> HomeAssistant | None:
+    """Home Assistant's MQTT broker, where the settings name one; relative paths are taken from `base`."""
+    if settings.mqtt.host is None:
+        return None
+    cache = state_dir / "matplotlib"
+    return HomeAssistant(settings.mqtt, bus, base=base, cache=cache, camera=settings.camera.id)
 
 
 def robot_source(settings: Settings, session: zenoh.Session) -> PoseSource:

@@ -27,6 +27,7 @@ from vad.csi.packets import CsiBatch
 from vad.daemon.adapters import (
     camera_source,
     csi_source,
+    home_assistant,
     join_sources,
     network_gate,
     robot_finder,
@@ -205,6 +206,9 @@ class Daemon:
             metrics = MetricsServer(settings.metrics.port, collector)
             group.create_task(metrics.run(), name="metrics")
             parts.append(metrics.health)
+        if (mqtt := home_assistant(settings, self._base, self._state_dir, self._bus)) is not None:
+            group.create_task(mqtt.run(), name="home assistant")
+            parts.append(mqtt.health)
         queues: dict[str, DropOldestQueue[Any]] = {"poses": poses, "frames": frames, "csi": batches}
         group.create_task(
             self._tell_status([*parts, *(s.health for s in joins)], queues, captures), name="status"

@@ -9,6 +9,7 @@ from vad.camera.lens_file import camera_lens
 from vad.config import Settings, pki_folder, resolve
 from vad.daemon.adapters import camera_source, robot_finder
 from vad.errors import ConfigError
+from vad.homeassistant.broker import check_settings
 from vad.pki.folder import PkiFolder
 from vad.robot.map_server import load_floor_plan, load_rooms
 
@@ -25,6 +26,7 @@ def check_files(settings: Settings, config_file: Path) -> None:
     camera_source(settings.camera, config_file.parent)
     camera_lens(settings.camera, config_file.parent)
     check_bus(settings, config_file)
+    check_settings(settings.mqtt, config_file.parent)
 
 
 def check_bus(settings: Settings, config_file: Path) -> None:

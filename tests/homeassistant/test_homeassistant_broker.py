@@ -1,0 +1,349 @@
+"""Home Assistant over MQTT, against a real Mosquitto: what is retained, what is seen when something ends."""
+
+from __future__ import annotations
+
+import asyncio
+import subprocess
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from mosquitto_world import Certificates, Mosquitto, Watcher, free_port, needs_mosquitto, retained_at
+
+from vad.bus import messages as m
+from vad.bus.grid import grid_to_png
+from vad.bus.node import Bus
+from vad.bus.session import BusSettings
+from vad.config.mqtt import MqttSettings
+from vad.homeassistant import link
+from vad.homeassistant.link import HomeAssistant
+from vad.homeassistant.topics import Topics
+
+LAMP, PHONE = "f4:f5:d8:d3:35:b2", "3a:11:22:33:44:55"
+TOPICS = Topics("vad", "homeassistant", "home")
+
+pytestmark = needs_mosquitto
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The waits of a year's run, shortened."""
+    monkeypatch.setattr(link, "FIRST_RETRY_S", 0.05)
+    monkeypatch.setattr(link, "LAST_RETRY_S", 0.2)
+    monkeypatch.setattr(link, "STATUS_EVERY_NS", 50_000_000)
+    monkeypatch.setattr(link, "DEVICE_EVERY_NS", 20_000_000)
+    monkeypatch.setattr(link, "PICTURE_EVERY_S", 0.05)
+
+
+@pytest.fixture
+def bus() -> Bus:
+    """A bus that is not opened: what is published is heard inside the daemon all the same."""
+    return Bus(BusSettings(hub="home", listen=("tcp/127.0.0.1:1",)))
+
+
+@asynccontextmanager
+async def home_assistant(bus: Bus, folder: Path, port: int, **settings: Any) -> AsyncIterator[HomeAssistant]:
+    """The link to the broker, running; it ends without a trace."""
+    told = MqttSettings(host="127.0.0.1", port=port, **settings)
+    running = HomeAssistant(told, bus, base=folder, cache=folder / "cache", camera="main")
+    task = asyncio.create_task(running.run())
+    try:
+        yield running
+    finally:
+        task.cancel()
+        await asyncio.wait({task})
+        assert task.cancelled() or task.exception() is None, task.exception()
+
+
+def device(mac: str, **changes: Any) -> m.DeviceMessage:
+    fields: dict[str, Any] = {
+        "source": "live",
+        "mac": mac,
+        "name": "Lamp",
+        "state": "mapped",
+        "x_m": 1.494,
+        "y_m": -0.26,
+        "covariance_m2": ((0.04, 0.0), (0.0, 0.01)),
+        "radius90_m": 0.45,
+        "room": "Living room",
+        "macs": (mac,),
+        "in_network": True,
+    }
+    return m.DeviceMessage(**(fields | changes))
+
+
+def status(step: str, **parts: str) -> m.StatusMessage:
+    told = tuple(
+        m.Part(part=part, state="ok" if said == "ok" else "degraded", detail=said)
+        for part, said in parts.items()
+    )
+    return m.StatusMessage(source="live", version="1", uptime_s=1.0, step=step, parts=told)
+
+
+async def test_devices_and_health_are_there_for_who_comes_later(bus: Bus, tmp_path: Path) -> None:
+    bus.publish_device(device(LAMP))
+    bus.publish_status(status("waiting for somebody to walk", camera="ok", robot="no pose for 5 s"))
+    with Mosquitto(tmp_path) as broker:
+        async with Watcher(broker.port) as watcher, home_assistant(bus, tmp_path, broker.port):
+            await watcher.until_says(TOPICS.availability, b"online")
+            await watcher.until(lambda: TOPICS.status in watcher.payloads, "the status")
+        kept = await retained_at(broker.port)
+    assert set(kept) == {
+        TOPICS.hub_config,
+        TOPICS.device_config(LAMP),
+        TOPICS.device(LAMP),
+        TOPICS.status,
+        TOPICS.availability,
+    }
+    assert kept[TOPICS.availability] == b"offline"  # the daemon has ended since
+    said = msgspec.json.decode(kept[TOPICS.device(LAMP)])
+    assert (said["room"], said["x_m"], said["y_m"], said["radius_90_m"]) == ("Living room", 1.49, -0.26, 0.45)
+    assert (said["sigma_m"], said["mapping"], said["in_zones"]) == (0.2, "mapped", ["zone.home"])
+    hub = msgspec.json.decode(kept[TOPICS.status])
+    assert (hub["problem"], hub["problems"]) == ("ON", {"robot": "no pose for 5 s"})
+    assert (hub["devices"], hub["mapped"], hub["step"]) == (1, 1, "waiting for somebody to walk")
+
+
+async def test_a_killed_broker_is_trouble_and_its_return_brings_everything(bus: Bus, tmp_path: Path) -> None:
+    bus.publish_device(device(LAMP))
+    with Mosquitto(tmp_path) as broker:
+        async with home_assistant(bus, tmp_path, broker.port) as running:
+            async with Watcher(broker.port) as watcher:
+                await watcher.until_says(TOPICS.availability, b"online")
+                assert running.health.state == "ok"
+                broker.kill()
+                await _until(lambda: running.health.state == "degraded")
+            bus.publish_device(device(LAMP, room="Kitchen"))
+            bus.publish_device(device(PHONE, name="Phone"))
+            broker.start()
+            async with Watcher(broker.port) as watcher:
+                await watcher.until(lambda: TOPICS.device(PHONE) in watcher.payloads, "what came meanwhile")
+                await watcher.until_says(TOPICS.availability, b"online")
+                assert watcher.json(TOPICS.device(LAMP))["room"] == "Kitchen"
+            assert running.health.state == "ok"
+            assert running.health.counters["connects"] == 2
+
+
+async def test_no_broker_is_no_reason_to_end(bus: Bus, tmp_path: Path) -> None:
+    async with home_assistant(bus, tmp_path, free_port()) as running:
+        await _until(lambda: running.health.state == "degraded")
+        assert "refused" in running.health.detail
+        assert "mqtt.host" in running.health.detail
+
+
+async def test_birth_of_home_assistant_brings_discovery_again(bus: Bus, tmp_path: Path) -> None:
+    bus.publish_device(device(LAMP))
+    with Mosquitto(tmp_path) as broker:
+        async with Watcher(broker.port) as watcher, home_assistant(bus, tmp_path, broker.port) as running:
+            await watcher.until_says(TOPICS.availability, b"online")
+            watcher.payloads.clear()
+            await watcher.put("homeassistant/status", b"offline")
+            await watcher.put("homeassistant/status", b"online")
+            await watcher.until(lambda: TOPICS.device_config(LAMP) in watcher.payloads, "discovery again")
+            await watcher.until(lambda: TOPICS.hub_config in watcher.payloads, "the hub again")
+            await watcher.until(lambda: TOPICS.device(LAMP) in watcher.payloads, "the state again")
+            await watcher.until_says(TOPICS.availability, b"online")
+            assert running.health.counters["births"] == 1
+
+
+async def test_a_killed_daemon_leaves_its_last_will(bus: Bus, tmp_path: Path) -> None:
+    """The connection breaks without a word, as it does when the daemon is killed."""
+    with Mosquitto(tmp_path) as broker:
+        async with (
+            Watcher(broker.port) as watcher,
+            _Relay(broker.port) as relay,
+            home_assistant(bus, tmp_path, relay.port),
+        ):
+            await watcher.until_says(TOPICS.availability, b"online")
+            relay.cut()
+            await watcher.until_says(TOPICS.availability, b"offline")
+
+
+async def test_what_an_earlier_run_left_is_cleaned_up(bus: Bus, tmp_path: Path) -> None:
+    bus.publish_device(device(LAMP))
+    foreign = "homeassistant/sensor/other/config"
+    with Mosquitto(tmp_path) as broker:
+        async with Watcher(broker.port) as watcher:
+            for topic in (TOPICS.device_config(PHONE), TOPICS.device(PHONE), foreign):
+                await watcher.put(topic, b"{}", retain=True)
+            await watcher.put(TOPICS.device_config(LAMP), b"{}", retain=True)
+        async with Watcher(broker.port) as watcher, home_assistant(bus, tmp_path, broker.port):
+            await watcher.until_says(TOPICS.device_config(PHONE), b"")
+            await watcher.until_says(TOPICS.device(PHONE), b"")
+            await watcher.until_says(TOPICS.availability, b"online")
+        kept = await retained_at(broker.port)
+    assert TOPICS.device_config(PHONE) not in kept
+    assert TOPICS.device(PHONE) not in kept
+    assert kept[foreign] == b"{}"
+    assert b"Lamp" in kept[TOPICS.device_config(LAMP)]
+
+
+async def test_a_forgotten_or_ignored_device_vanishes(bus: Bus, tmp_path: Path) -> None:
+    bus.publish_device(device(LAMP))
+    bus.publish_device(device(PHONE))
+    with Mosquitto(tmp_path) as broker:
+        async with Watcher(broker.port) as watcher, home_assistant(bus, tmp_path, broker.port):
+            await watcher.until_says(TOPICS.availability, b"online")
+            bus.forget_device(PHONE)
+            await watcher.until_says(TOPICS.device(PHONE), b"")
+            kept = await retained_at(broker.port)
+            assert TOPICS.device_config(PHONE) not in kept
+            assert TOPICS.device_config(LAMP) in kept
+            bus.publish_device(device(PHONE))
+            for topic in (TOPICS.device(PHONE), TOPICS.device_config(PHONE)):
+                await watcher.until(lambda topic=topic: watcher.payloads[topic] != b"", f"{topic} is back")
+
+
+async def test_a_storm_of_changes_becomes_few_updates_and_the_last_counts(
+    bus: Bus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(link, "DEVICE_EVERY_NS", 200_000_000)
+    bus.publish_device(device(LAMP))
+    with Mosquitto(tmp_path) as broker:
+        async with Watcher(broker.port) as watcher, home_assistant(bus, tmp_path, broker.port):
+            await watcher.until_says(TOPICS.availability, b"online")
+            before = len(watcher.came)
+            for i in range(1000):
+                bus.publish_device(device(LAMP, x_m=float(i)))
+                bus.publish_device(device(LAMP, x_m=float(i)))
+                if i % 50 == 0:
+                    await asyncio.sleep(0)
+            await watcher.until(
+                lambda: watcher.json(TOPICS.device(LAMP))["x_m"] == 999.0, "the last of a thousand"
+            )
+            came = [topic for topic, _ in watcher.came[before:]]
+    assert came.count(TOPICS.device(LAMP)) <= 4
+    assert TOPICS.device_config(LAMP) not in came
+
+
+@pytest.mark.slow
+async def test_the_map_is_a_picture_that_follows(bus: Bus, tmp_path: Path) -> None:
+    cells = np.zeros((40, 60), np.int8)
+    cells[0, :] = cells[-1, :] = 100
+    bus.publish_map(
+        m.MapMessage(
+            source="live",
+            epoch=1,
+            bounds_m=(0, 0, 3, 2),
+            resolution_m=0.05,
+            origin=(0, 0, 0),
+            width=60,
+            height=40,
+            rooms=(m.Room(name="Living room", polygon_m=((0, 0), (3, 0), (3, 2), (0, 2))),),
+        )
+    )
+    bus.publish_grid(grid_to_png(cells))
+    bus.publish_device(device(LAMP, y_m=1.0))
+    with Mosquitto(tmp_path) as broker:
+        async with Watcher(broker.port) as watcher, home_assistant(bus, tmp_path, broker.port):
+            await watcher.until(lambda: TOPICS.map in watcher.payloads, "the picture", 45)
+            first = watcher.payloads[TOPICS.map]
+            assert first.startswith(b"\x89PNG")
+            bus.publish_device(device(LAMP, y_m=1.0, last_seen="2026-01-01T00:00:00Z"))
+            bus.publish_device(device(LAMP, y_m=1.5))
+            await watcher.until(lambda: watcher.payloads[TOPICS.map] != first, "another picture", 45)
+            assert [topic for topic, _ in watcher.came].count(TOPICS.map) == 2
+
+
+@pytest.fixture
+def users(tmp_path: Path) -> Path:
+    """Mosquitto's file of who may come in: vad, with the password sesame."""
+    file = tmp_path / "users"
+    subprocess.run(["mosquitto_passwd", "-c", "-b", str(file), "vad", "sesame"], check=True, timeout=20)
+    file.chmod(0o644)
+    return file
+
+
+async def test_a_password_is_wanted_and_read_from_its_file(bus: Bus, tmp_path: Path, users: Path) -> None:
+    secret = tmp_path / "mqtt.password"
+    secret.write_text("wrong\n")
+    with Mosquitto(tmp_path, "allow_anonymous false", f"password_file {users}") as broker:
+        async with home_assistant(bus, tmp_path, broker.port) as running:
+            await _until(lambda: "does not let in us without a name" in running.health.detail)
+        async with (
+            Watcher(broker.port, username="vad", password="sesame") as watcher,
+            home_assistant(
+                bus, tmp_path, broker.port, username="vad", password_file="mqtt.password"
+            ) as running,
+        ):
+            await _until(lambda: "does not let in vad" in running.health.detail)
+            secret.write_text("sesame\n")  # read anew at every attempt
+            await watcher.until_says(TOPICS.availability, b"online")
+
+
+async def test_tls_with_the_brokers_and_its_own_certificate(bus: Bus, tmp_path: Path) -> None:
+    authority = Certificates(tmp_path)
+    certificate, key = authority.issue("broker")
+    authority.issue("hub")
+    lines = (f"cafile {authority.ca}", f"certfile {certificate}", f"keyfile {key}")
+    require = ("require_certificate true", "use_identity_as_username true", "allow_anonymous false")
+    with Mosquitto(tmp_path, *lines, *require) as broker:
+        context = authority.context()
+        context.load_cert_chain(tmp_path / "hub.pem", tmp_path / "hub.key")
+        async with home_assistant(bus, tmp_path, broker.port, tls=True) as running:
+            await _until(lambda: "its certificate does not count" in running.health.detail)
+        async with (
+            Watcher(broker.port, tls_context=context) as watcher,
+            home_assistant(
+                bus,
+                tmp_path,
+                broker.port,
+                tls=True,
+                ca_file="ca.pem",
+                certificate_file="hub.pem",
+                key_file="hub.key",
+            ),
+        ):
+            await watcher.until_says(TOPICS.availability, b"online")
+
+
+async def _until(condition: Any, timeout_s: float = 15.0) -> None:
+    async with asyncio.timeout(timeout_s):
+        while not condition():  # noqa: ASYNC110 - health has no event
+            await asyncio.sleep(0.01)
+
+
+class _Relay:
+    """A TCP connection in between that can be cut."""
+
+    def __init__(self, to_port: int) -> None:
+        self._to_port = to_port
+        self._writers: list[asyncio.StreamWriter] = []
+        self.port = 0
+
+    async def __aenter__(self) -> _Relay:
+        self._group = asyncio.TaskGroup()
+        await self._group.__aenter__()
+        self._server = await asyncio.start_server(self._accept, "127.0.0.1", 0)
+        self.port = self._server.sockets[0].getsockname()[1]
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.cut()
+        await self._group.__aexit__(None, None, None)
+
+    def cut(self) -> None:
+        """Nobody gets through any more."""
+        self._server.close()
+        for writer in self._writers:
+            writer.transport.abort()
+
+    async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        there, back = await asyncio.open_connection("127.0.0.1", self._to_port)
+        self._writers += [writer, back]
+        self._group.create_task(self._copy(reader, back))
+        self._group.create_task(self._copy(there, writer))
+
+    @staticmethod
+    async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            while data := await reader.read(65536):
+                writer.write(data)
+        except ConnectionError:
+            return
+        finally:
+            writer.close()
