@@ -27,8 +27,8 @@ class LineModel:
     the walls do to the ridge, and for how long.
     """
 
-    kappa: float = 0.935
-    kappa_sd: float = 0.02
+    kappa: float = 0.945
+    kappa_sd: float = 0.03
     surface_m: float = 0.1
     surface_sd_m: float = 0.06
     torso_z_m: float = 0.95

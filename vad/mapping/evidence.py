@@ -16,7 +16,7 @@ HEARD_SHARE = 1.0
 HEARD_SHARE_WITH_PHASES = 0.75
 """How much the walker's loudness counts; less where the antennas' phases tell the range, too."""
 
-DOPPLER_CORRELATION = 0.25
+DOPPLER_CORRELATION = 0.18
 ARRIVAL_CORRELATION = 0.5
 """Walks through one room share their multipath and the walker's ways: n walks count as n / (1 + (n - 1) c)
 independent ones (method.md 3). Chosen on the plain-room recordings so that 90 % regions keep their word."""
