@@ -292,7 +292,7 @@ def _said() -> Iterator[None]:
         if error.errno == errno.EACCES:
             what, remedy = (
                 "the Kinect may not be opened",
-                "install the udev rule systemd/70-vad-kinect2.rules",
+                "install the udev rule systemd/70-vad.rules",
             )
         elif error.errno in (errno.ENODEV, errno.EIO, errno.EPIPE, errno.EPROTO):
             what, remedy = "the Kinect was unplugged", ""
