@@ -129,6 +129,7 @@ class CameraMessage(Message, frozen=True, kw_only=True):
     deviation_m: mean floor error over the pairs. time_offset_ms: camera stamp minus pose stamp of one moment.
     """
 
+    floor_m: outline of the floor in its picture, within the map's bounds; walls are not considered.
     schema: Literal["vad.camera.v1"] = "vad.camera.v1"
     id: str
     state: CameraState
@@ -143,6 +144,7 @@ class CameraMessage(Message, frozen=True, kw_only=True):
     pairs: int = 0
 
 
+    floor_m: tuple[Point, ...] | None = None
 class Room(msgspec.Struct, frozen=True, kw_only=True):
     """A named room; its outline in the map frame."""
 

@@ -43,6 +43,7 @@ from vad.config.robot import (
     ZenohRobot,
     brings_map,
 )
+from vad.config.web import WebSettings
 
 __all__ = [
     "AbsolutePath",
@@ -76,6 +77,7 @@ __all__ = [
     "V4l2CameraSettings",
     "ValetudoRobot",
     "VisionSettings",
+    "WebSettings",
     "ZenohRobot",
     "agent_settings",
     "brings_map",

@@ -27,6 +27,7 @@ _HUB_CHOSEN: dict[str, Any] = {
     "robot": {"type": "neato", "port": "/dev/ttyACM0", "lidar": True},
     "camera": {"source": {"type": "v4l2", "device": "/dev/video0"}},
     "devices": {"hostapd": ["/run/hostapd/wlan0"]},
+    "web": {"port": 9748},
 }
 _AGENT_CHOSEN: dict[str, Any] = {
     "hub": "tls/192.168.1.10:7448",

@@ -13,6 +13,7 @@ from vad.config.kinds import Id, Positive
 from vad.config.mqtt import MqttSettings
 from vad.config.radio import RadioSettings
 from vad.config.robot import RobotSettings
+from vad.config.web import WebSettings
 
 
 class MapSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -118,5 +119,6 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     bus: BusSettings = BusSettings()
     metrics: MetricsSettings = MetricsSettings()
     mqtt: MqttSettings = MqttSettings()
+    web: WebSettings = WebSettings()
     capture: CaptureSettings = CaptureSettings()
     vision: VisionSettings = VisionSettings()

@@ -41,6 +41,7 @@ from vad.daemon.eyes import Eyes, known_calibration
 from vad.daemon.floor import SAY_WAITING_S, Change, FloorKeeper, first_plan, follow_plans
 from vad.daemon.metrics import MetricsServer, StatusCollector
 from vad.daemon.notify import notify
+from vad.daemon.page import page_access, web_page
 from vad.daemon.parts import Parts
 from vad.daemon.past import StoredPast
 from vad.daemon.registry import Registry
@@ -49,6 +50,7 @@ from vad.devices.station import StationEvent
 from vad.errors import VadError
 from vad.health import Health
 from vad.mapping.camera_calibration import CameraCalibration
+from vad.mapping.camera_floor import floor_in_picture
 from vad.mapping.reanchor import moved_calibration
 from vad.robot.floor_plan import FloorPlan
 from vad.robot.map_server import load_floor_plan, load_rooms
@@ -116,6 +118,7 @@ class Daemon:
         self._bus = bus
         self._store = store
         self._gate = network_gate(settings, config_file)
+        self._access = page_access(settings, config_file.parent)
         self._started = time.monotonic()
         self._parts = Parts()
         self._calibrations: DropOldestQueue[CameraCalibration] = DropOldestQueue(1)
@@ -209,6 +212,10 @@ class Daemon:
         if (mqtt := home_assistant(settings, self._base, self._state_dir, self._bus)) is not None:
             group.create_task(mqtt.run(), name="home assistant")
             parts.append(mqtt.health)
+        if self._access is not None:
+            page = web_page(settings, self._access, self._bus, wishes, robot, eyes)
+            group.create_task(page.run(), name="web")
+            parts.append(page.health)
         queues: dict[str, DropOldestQueue[Any]] = {"poses": poses, "frames": frames, "csi": batches}
         group.create_task(
             self._tell_status([*parts, *(s.health for s in joins)], queues, captures), name="status"
@@ -339,6 +346,7 @@ class Daemon:
                 time_offset_ms=None if offset_s is None else float(offset_s) * 1e3,
                 epoch=self._plan.epoch,
                 pairs=int(calibration.pairs),
+                floor_m=floor_in_picture(calibration, self._plan.bounds_m),
             )
         )
 

@@ -8,6 +8,7 @@ from vad.bus.session import check_endpoint, local_endpoints, tls_endpoints
 from vad.camera.lens_file import camera_lens
 from vad.config import Settings, pki_folder, resolve
 from vad.daemon.adapters import camera_source, robot_finder
+from vad.daemon.page import page_access
 from vad.errors import ConfigError
 from vad.homeassistant.broker import check_settings
 from vad.pki.folder import PkiFolder
@@ -25,6 +26,7 @@ def check_files(settings: Settings, config_file: Path) -> None:
     robot_finder(settings.vision, config_file.parent)
     camera_source(settings.camera, config_file.parent)
     camera_lens(settings.camera, config_file.parent)
+    page_access(settings, config_file.parent)
     check_bus(settings, config_file)
     check_settings(settings.mqtt, config_file.parent)
 

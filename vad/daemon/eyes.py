@@ -62,6 +62,7 @@ class Eyes:
 
     Attributes:
         last_image: the picture of the last frame seen, not to be changed.
+        robot_pose: where the robot was last.
     """
 
     def __init__(
@@ -81,6 +82,7 @@ class Eyes:
         self.frames = 0
         self.last_frame_ns = 0
         self.last_image: NDArray[np.uint8] | None = None
+        self.robot_pose: RobotPose | None = None
         self._walkers = Walkers(network)
         self._focal_px = focal_px
         self._lens = lens
@@ -149,6 +151,7 @@ class Eyes:
         while True:
             pose = await poses.get()
             self._poses.append(pose)
+            self.robot_pose = pose
             xy = np.array([pose.x_m, pose.y_m])
             if np.linalg.norm(xy - self._rest_xy) > ROBOT_MOVING_M:
                 self._rest_xy = xy

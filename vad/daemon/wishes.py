@@ -25,7 +25,7 @@ _log = logging.getLogger(__name__)
 
 
 class Wishes:
-    """Answers DeviceWish queries on `vad/<hub>/wishes`."""
+    """Answers DeviceWish queries on `vad/<hub>/wishes`, and who asks inside the daemon."""
 
     def __init__(self, keys: HubKeys, registry: Registry, source: m.Source) -> None:
         self._keys = keys
@@ -48,7 +48,7 @@ class Wishes:
         try:
             while True:
                 query = await inbox.get()
-                reply = await self._answer(b"" if query.payload is None else query.payload.to_bytes())
+                reply = await self.answer(b"" if query.payload is None else query.payload.to_bytes())
                 # in a thread: an asker that does not read must not stop the loop
                 await asyncio.to_thread(partial(_send, query, self._keys.wishes, reply))
         finally:
@@ -56,7 +56,8 @@ class Wishes:
             with contextlib.suppress(zenoh.ZError):
                 queryable.undeclare()  # type: ignore[no-untyped-call]
 
-    async def _answer(self, payload: bytes) -> m.WishReply | m.ErrorMessage:
+    async def answer(self, payload: bytes) -> m.WishReply | m.ErrorMessage:
+        """Grant a DeviceWish in JSON: what became of it, or why it cannot be."""
         if len(payload) > MAX_BYTES:
             return m.ErrorMessage(code="bad_wish", text="The wish is too long")
         try:
