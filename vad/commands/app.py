@@ -22,6 +22,7 @@ from vad.commands.replay import replay
 from vad.commands.robot import app as robot_app
 from vad.commands.run import check_config, run
 from vad.commands.sessions import sessions_app
+from vad.commands.setup import setup
 from vad.commands.sim import sim
 from vad.commands.status import status
 
@@ -49,6 +50,7 @@ def _vad(
     loading.finish(context.invoked_subcommand)
 
 
+app.command()(setup)
 app.command()(run)
 app.command("check-config")(check_config)
 app.add_typer(config_app, name="config")

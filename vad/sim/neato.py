@@ -18,6 +18,7 @@ from pathlib import Path
 Pose = tuple[float, float, float]
 """x_m, y_m, yaw_rad in the robot's map."""
 
+VERSION = "Component,Major,Minor,Build,Aux\r\nModelID,-1,BotVacD5,,\r\nSoftware,4,5,3,142"
 _MAX_LINE_BYTES = 256
 _END_OF_REPLY = b"\x1a"
 
@@ -93,6 +94,8 @@ class VirtualNeato:
             body = _pose_line(self._pose_at(t_ns), t_ns)
         elif len(words) == 1 and "getldsscan".startswith(words[0]) and len(words[0]) >= len("getld"):
             body = _scan_lines(self._scan_at(t_ns))
+        elif len(words) == 1 and "getversion".startswith(words[0]) and len(words[0]) >= len("getv"):
+            body = VERSION
         else:
             body = f"Unknown Cmd: '{command}'"
         return f"{command}\r\n{body}\r\n".encode("ascii", "replace") + _END_OF_REPLY
