@@ -110,6 +110,31 @@ def test_overlay_draws_the_floor_where_it_is(result: tuple[Drive, CameraCalibrat
         draw_overlay(blank, CameraCalibration("collecting", 0, ""))
 
 
+def test_overlay_draws_no_floor_behind_a_wall(result: tuple[Drive, CameraCalibration, Deviations]) -> None:
+    drive, found, _ = result
+    assert found.position_m is not None
+    xy = drive.robot_xy_m(np.linspace(5.0, 25.0, 200))
+    px = drive.pixels(xy)
+    # A wall across the line of sight to the farthest place of the drive, half way there.
+    far = int(
+        np.nanargmax(np.where(np.isfinite(px[:, 0]), np.linalg.norm(xy - found.position_m[:2], axis=1), 0))
+    )
+    sight = xy[far] - found.position_m[:2]
+    across = np.array([-sight[1], sight[0]]) / np.linalg.norm(sight)
+    wall = found.position_m[:2] + 0.5 * sight + np.linspace(-1.0, 1.0, 81)[:, None] * across
+    blank = np.full((480, 640, 3), 90, dtype=np.uint8)
+
+    def ink(walls_m: np.ndarray | None) -> int:
+        x, y = px[far].astype(int)
+        drawn = draw_overlay(blank, found, walls_m=walls_m, errors=True)
+        return int(np.count_nonzero(drawn[y - 5 : y + 6, x - 5 : x + 6] != 90))
+
+    assert ink(None) > 100
+    assert ink(wall) == 0
+    # What the camera hangs on hides nothing.
+    assert ink(found.position_m[:2] + 0.2 * across * np.linspace(-1.0, 1.0, 9)[:, None]) > 100
+
+
 def test_wrong_use_is_told_in_one_line(tmp_path: Path) -> None:
     run = CliRunner()
     for command in ("calibrate", "check"):

@@ -28,6 +28,7 @@ from vad.commands.console import (
 )
 from vad.commands.robot import running_robot
 from vad.commands.run import DEFAULT_CONFIG, ConfigOption
+from vad.commands.signals import until_ended
 from vad.config import Settings, load_settings, resolve
 from vad.errors import VadError
 from vad.streams import DropOldestQueue
@@ -101,7 +102,6 @@ def calibrate(
         if as_json:
             print_json(result_json(found))
             return
-        out.print(progress_table(found))
         if drive is not None:
             out.print(check_table(rows_of(drive, found)))
         out.print(Text("kept; the daemon uses it from its next start on", "green"))
@@ -160,8 +160,8 @@ def _drive(
     if picture is not None and picture.suffix != ".png":
         raise VadError("the name does not end in .png", where=str(picture))
     started: list[Session] = []
-    with contextlib.suppress(KeyboardInterrupt):
-        asyncio.run(_watch(settings, config_file, seconds, started, quiet=as_json, known=known))
+    watching = _watch(settings, config_file, seconds, started, quiet=as_json, known=known)
+    asyncio.run(until_ended(watching))
     if not started:
         raise VadError("ended before the robot's map came")
     session = started[0]
@@ -251,6 +251,8 @@ async def _watch(
                 for task in tasks:
                     task.cancel()
                 await asyncio.gather(*tasks, return_exceptions=True)
+    if not quiet and not out.is_terminal:
+        out.print()  # there the live table's last line is left open
 
 
 def _waiting(detail: str) -> str:

@@ -20,6 +20,7 @@ from vad.camera.frame import Frame
 from vad.camera.lens_file import LensFile, write_lens
 from vad.commands.console import EXIT_NOTHING, JsonOption, complain, out, print_json, reported_errors
 from vad.commands.run import DEFAULT_CONFIG, ConfigOption
+from vad.commands.signals import until_ended
 from vad.config import load_settings
 from vad.errors import SourceError, VadError
 from vad.streams import DropOldestQueue
@@ -92,8 +93,8 @@ def intrinsics(
             _from_recording(recording, measurement, quiet=as_json)
         else:
             settings = load_settings(config)
-            with contextlib.suppress(KeyboardInterrupt):
-                asyncio.run(_live(settings.camera, config.resolve().parent, measurement, seconds, as_json))
+            watching = _live(settings.camera, config.resolve().parent, measurement, seconds, as_json)
+            asyncio.run(until_ended(watching))
         try:
             measured = measurement.solve()
         except ValueError as error:

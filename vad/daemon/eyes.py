@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vad.camera.frame import Frame
+from vad.daemon.robot_motion import RobotMotion
 from vad.daemon.walkers import PeopleSeen, Walkers
 from vad.geometry import Intrinsics
 from vad.health import Health
@@ -27,8 +28,6 @@ from vad.vision.robot import CandidateFinder, RobotCandidate, RobotFinder
 _log = logging.getLogger(__name__)
 
 SOLVE_EVERY_NS = 3_000_000_000
-ROBOT_MOVING_M = 0.03
-ROBOT_RESTS_AFTER_NS = 3_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,15 +93,14 @@ class Eyes:
         self._looked_ns = -LOOK_EVERY_NS
         self._frame_listeners: list[Callable[[int], None]] = []
         self._poses: list[RobotPose] = []
-        self._rest_xy = np.full(2, np.inf)
-        self._robot_moved_ns = -ROBOT_RESTS_AFTER_NS
+        self._motion = RobotMotion()
         self._solved_ns = 0
         self._new_evidence = False
 
     @property
     def robot_moves(self) -> bool:
         """Whether the robot drove within the last seconds before the last frame."""
-        return self.last_frame_ns - self._robot_moved_ns < ROBOT_RESTS_AFTER_NS
+        return self._motion.moves(self.last_frame_ns)
 
     def deviations(self) -> Deviations | None:
         """Robot against camera over what has been collected; None while nothing valid stands."""
@@ -152,10 +150,7 @@ class Eyes:
             pose = await poses.get()
             self._poses.append(pose)
             self.robot_pose = pose
-            xy = np.array([pose.x_m, pose.y_m])
-            if np.linalg.norm(xy - self._rest_xy) > ROBOT_MOVING_M:
-                self._rest_xy = xy
-                self._robot_moved_ns = pose.t_ns
+            self._motion.add(pose)
 
     async def run(self, frames: DropOldestQueue[Frame]) -> None:
         """See until cancelled."""
@@ -166,7 +161,7 @@ class Eyes:
             await self._look(frame)
 
     async def _look(self, frame: Frame) -> None:
-        robot_moves = frame.t_ns - self._robot_moved_ns < ROBOT_RESTS_AFTER_NS
+        robot_moves = self._motion.moves(frame.t_ns)
         seen = await asyncio.to_thread(self._see, frame, robot_moves)
         self.frames += 1
         self.last_frame_ns = frame.t_ns
