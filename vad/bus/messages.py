@@ -127,9 +127,9 @@ class CameraMessage(Message, frozen=True, kw_only=True):
     percent: 0-100, how much of the calibration's evidence is there. position_m: optical centre in the map.
     map_from_camera: rotation, row-major. map_from_image: homography of undistorted pixels to the floor.
     deviation_m: mean floor error over the pairs. time_offset_ms: camera stamp minus pose stamp of one moment.
+    floor_m: outline of the floor in its picture, within the map's bounds; walls are not considered.
     """
 
-    floor_m: outline of the floor in its picture, within the map's bounds; walls are not considered.
     schema: Literal["vad.camera.v1"] = "vad.camera.v1"
     id: str
     state: CameraState
@@ -142,9 +142,9 @@ class CameraMessage(Message, frozen=True, kw_only=True):
     time_offset_ms: float | None = None
     epoch: int = 0
     pairs: int = 0
-
-
     floor_m: tuple[Point, ...] | None = None
+
+
 class Room(msgspec.Struct, frozen=True, kw_only=True):
     """A named room; its outline in the map frame."""
 
