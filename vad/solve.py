@@ -50,6 +50,11 @@ class Solved:
     paper_m: FloatArray | None
 
     @property
+    def height90_m(self) -> tuple[float, float] | None:
+        """Lowest and highest height of the device, 90 %; None where it is not told."""
+        return None if self.evidence.terms is None else self.evidence.terms.height_range_m()
+
+    @property
     def error_m(self) -> float | None:
         """Distance of the likelihood estimate from the truth, where that is known."""
         return _error(None if self.place is None else self.place.xy_m, self.session.truth_m)
@@ -68,6 +73,7 @@ class Fused:
     sessions: tuple[str, ...]
     place: PlaceEstimate
     truth_m: FloatArray | None
+    height90_m: tuple[float, float] | None = None
 
     @property
     def error_m(self) -> float | None:
@@ -154,6 +160,7 @@ def fuse(solved: Sequence[Solved]) -> list[Fused]:
                 tuple(m.session.header.id for m in members),
                 place_from_posterior(total.posterior(grid)),
                 members[0].session.truth_m,
+                total.height_range_m(),
             )
         )
     return results

@@ -10,6 +10,7 @@ from contextlib import asynccontextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from daemon_world import true_calibration, until
 from test_daemon_parts import Hub, hub
@@ -20,7 +21,8 @@ from vad.capture.archive import CUT_OFF, sessions_in, total_bytes
 from vad.capture.session import SCHEMA, SessionAnchor, SessionDevice, SessionHeader, load_session
 from vad.capture.session_writer import SessionWriter
 from vad.daemon.decisions import read
-from vad.mapping.posterior import Grid, Posterior
+from vad.mapping.evidence import Terms
+from vad.mapping.posterior import Grid
 from vad.sim.household import Household, Visit, hear, make_household
 from vad.sim.render import Renderer
 from vad.vision.people import PoseNetwork
@@ -31,9 +33,11 @@ LAMP, TV = HOUSE.devices[0], HOUSE.devices[1]
 VISIT = HOUSE.visits[0]
 S = 1_000_000_000
 GRID = Grid.over(HOUSE.plan.bounds_m, 0.1)
-EARLIER = Posterior(
+EARLIER = Terms(
     GRID,
-    (-((GRID.points_m - LAMP.place_m(0.0)[:2]) ** 2).sum(axis=1) / 2).reshape(GRID.rows, GRID.columns),
+    1,
+    -((GRID.points_m - LAMP.place_m(0.0)[:2]) ** 2).sum(axis=1) / 2,
+    np.zeros(GRID.rows * GRID.columns),
 )
 """What an earlier walk said of the lamp: one metre of standard deviation."""
 SHORT = {"min_s": 3.0, "max_s": 6.0, "mapped_radius_m": 5.0, "min_walks": 1}

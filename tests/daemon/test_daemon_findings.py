@@ -16,7 +16,8 @@ from vad.bus.session import BusSettings
 from vad.daemon.findings import DeviceGoneError, Findings
 from vad.daemon.registry import DOUBTED, Registry
 from vad.daemon.solver_child import SolvedWalk
-from vad.mapping.posterior import Grid, Posterior
+from vad.mapping.evidence import Terms
+from vad.mapping.posterior import Grid
 from vad.sim.household import make_household
 from vad.store.worker import StoreWorker
 
@@ -50,8 +51,8 @@ class House:
 
     async def walk(self, at: np.ndarray[tuple[int, ...], np.dtype[np.float64]], sigma_m: float = 0.3) -> str:
         square = ((GRID.points_m - at) ** 2).sum(axis=1)
-        posterior = Posterior(GRID, (-square / (2 * sigma_m**2)).reshape(GRID.rows, GRID.columns))
-        walk = SolvedWalk("located", "", posterior, 4000, 15.0, 1)
+        terms = Terms(GRID, 1, -square / (2 * sigma_m**2), np.zeros(len(square)))
+        walk = SolvedWalk("located", "", terms, 4000, 15.0, 1)
         finding = await self.findings.take(LAMP, walk)
         return f"{finding.verdict}: {finding.text}"
 

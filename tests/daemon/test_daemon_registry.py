@@ -22,7 +22,8 @@ from vad.client import VadClient
 from vad.daemon.registry import Registry
 from vad.devices.station import Kind, StationEvent
 from vad.errors import VadError
-from vad.mapping.posterior import Grid, Posterior
+from vad.mapping.evidence import Terms
+from vad.mapping.posterior import Grid
 from vad.sim.home import floor_plan
 from vad.sim.scenario import make_home
 from vad.store.records import DeviceRecord
@@ -37,10 +38,10 @@ PLACE = (1.0, 1.5)
 T = TypeVar("T")
 
 
-def evidence(sigma_m: float, at: tuple[float, float] = PLACE, grid: Grid = GRID) -> Posterior:
+def evidence(sigma_m: float, at: tuple[float, float] = PLACE, grid: Grid = GRID) -> Terms:
     """One walk that tells the place with this standard deviation."""
     square = ((grid.points_m - np.array(at)) ** 2).sum(axis=1)
-    return Posterior(grid, (-square / (2 * sigma_m**2)).reshape(grid.rows, grid.columns))
+    return Terms(grid, 1, -square / (2 * sigma_m**2), np.zeros(len(square)))
 
 
 class Hub:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vad.mapping.device_stage import place_from_posterior
-from vad.mapping.evidence import joint_posterior
+from vad.mapping.evidence import DOPPLER_CORRELATION, Terms
 from vad.mapping.posterior import Grid, Posterior
 
 GRID = Grid.over((-3.0, -2.0, 5.0, 4.0), 0.1)
@@ -64,9 +64,21 @@ def test_fusing_multiplies_and_refuses_another_grid() -> None:
         fused.fused(Posterior(Grid.over((0, 0, 1, 1), 0.1), np.zeros((11, 11))))
 
 
-def test_correlated_walks_count_as_fewer() -> None:
-    one = gaussian(0.0, 0.0, 0.4)
-    four = joint_posterior(one.fused(one).fused(one).fused(one), 4)
-    _, covariance = four.mean_and_covariance()
-    assert 0.16 / 4 < covariance[0, 0] < 0.16
-    assert np.array_equal(joint_posterior(one, 1).log_density, one.log_density)
+def test_correlated_walks_count_as_fewer_and_loudness_once() -> None:
+    told = gaussian(0.0, 0.0, 0.4).log_density.ravel()
+    one = Terms(GRID, 1, told, np.log(1 / (1 + GRID.points_m[:, 0] ** 2)))
+    four = one.plus(one).plus(one).plus(one)
+    _, covariance = four.posterior(GRID).mean_and_covariance()
+    assert 0.16 / 4 < covariance[1, 1] < 0.16
+    assert four.log_density() - (1 / (1 + 3 * DOPPLER_CORRELATION)) * four.doppler == pytest.approx(one.heard)
+
+
+def test_compact_terms_say_what_the_whole_ones_say() -> None:
+    coarse = Grid.over(GRID.bounds_m, 0.2)
+    told = -((coarse.points_m - [0.5, 0.2]) ** 2).sum(axis=1)
+    sums = np.random.default_rng(1).uniform(0, 3, size=(len(told), 3, 13, 13)).astype(np.float32)
+    whole = Terms(coarse, 1, told, 0.1 * told, sums, np.array([0.0, -1, -2, -3, -4, -5, -6]))
+    compact = whole.compact(GRID)
+    assert compact.arrival is None
+    assert compact.posterior(GRID).probability == pytest.approx(whole.posterior(GRID).probability, abs=1e-4)
+    assert compact.height_range_m() == whole.height_range_m()

@@ -49,6 +49,7 @@ MAPPED = replace(
         ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0)),
         "Küche",
         "doppler",
+        (0.4, 1.5),
     ),
 )
 
@@ -56,7 +57,7 @@ MAPPED = replace(
 def posterior(seed: int = 1) -> PosteriorRecord:
     grid = np.random.default_rng(seed).normal(size=(40, 60)).astype(np.float32)
     grid[0, 0] = -np.inf
-    return PosteriorRecord(MAC, 3, (-1.0, 0.0, 5.0, 4.0), 0.1, 2, grid, T1)
+    return PosteriorRecord(MAC, 3, (-1.0, 0.0, 5.0, 4.0), 0.1, 2, grid, T1, grid + 1, (0.0, -0.5))
 
 
 def test_everything_written_is_there_after_a_restart(tmp_path: Path) -> None:
@@ -80,6 +81,9 @@ def test_everything_written_is_there_after_a_restart(tmp_path: Path) -> None:
         assert kept is not None
         expected = posterior()
         np.testing.assert_array_equal(kept.log_posterior, expected.log_posterior)
+        assert kept.log_heard is not None
+        np.testing.assert_array_equal(kept.log_heard, expected.log_posterior + 1)
+        assert kept.height == expected.height
         assert kept.log_posterior.dtype == np.float32
         assert (kept.bounds_m, kept.step_m, kept.walks) == (expected.bounds_m, expected.step_m, 2)
         assert store.cameras(3) == [camera]

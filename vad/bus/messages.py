@@ -47,7 +47,8 @@ class DeviceMessage(Message, frozen=True, kw_only=True):
 
     reason: why it waits, failed or is stale; empty otherwise. covariance_m2: 2x2 of (x, y). radius90_m:
     radius of the circle around (x, y) that holds 90 % of the posterior. region90: outline of the 90 % region,
-    metres. walks: how many walks went into the estimate. evidence: named counts (packets, seconds ...).
+    metres. height90_m: lowest and highest height above the floor that hold 90 %; null where it is not told.
+    walks: how many walks went into the estimate. evidence: named counts (packets, seconds ...).
 
     mac: the address it was first seen with, its name for good; macs: every address it had, the present one
     last; random_mac: whether that one is made up. host_name: what it calls itself. vendor: its maker. agent:
@@ -71,6 +72,7 @@ class DeviceMessage(Message, frozen=True, kw_only=True):
     evidence: dict[str, float] = {}
     updated_at: str | None = None
     method: str | None = None
+    height90_m: tuple[float, float] | None = None
     macs: tuple[str, ...] = ()
     random_mac: bool = False
     ip: str | None = None

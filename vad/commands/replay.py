@@ -107,13 +107,14 @@ def _make_folder(folder: Path) -> None:
         raise typer.BadParameter(f"{folder}: {error.strerror}", param_hint="--plot") from None
 
 
-def _place_record(place: PlaceEstimate) -> dict[str, Any]:
+def _place_record(place: PlaceEstimate, height90_m: tuple[float, float] | None) -> dict[str, Any]:
     return {
         "x_m": round(float(place.xy_m[0]), 3),
         "y_m": round(float(place.xy_m[1]), 3),
         "covariance_m2": np.round(place.covariance_m2, 5).tolist(),
         "radius90_m": round(place.radius90_m, 3),
         "region90_m": [np.round(outline, 3).tolist() for outline in place.region90_m],
+        "height90_m": None if height90_m is None else [_rounded(z_m) for z_m in height90_m],
     }
 
 
@@ -129,9 +130,10 @@ def _session_record(solved: Solved) -> dict[str, Any]:
         "covariance_m2": None,
         "radius90_m": None,
         "region90_m": None,
+        "height90_m": None,
     }
     if solved.place is not None:
-        place = _place_record(solved.place)
+        place = _place_record(solved.place, solved.height90_m)
     paper = None
     if solved.paper_m is not None:
         paper = {
@@ -161,7 +163,7 @@ def _fused_record(fused: Fused) -> dict[str, Any]:
         "method": LIKELIHOOD,
         "status": fused.place.status,
         "reason": fused.place.reason,
-        **_place_record(fused.place),
+        **_place_record(fused.place, fused.height90_m),
         "error_m": _rounded(fused.error_m),
     }
 

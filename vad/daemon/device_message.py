@@ -24,6 +24,7 @@ def device_message(
             "region90": place.region90,
             "room": place.room,
             "method": place.method,
+            "height90_m": place.height90_m,
         }
     if device is not None:
         known |= {

@@ -14,7 +14,7 @@ from vad.daemon.registry import Registry
 from vad.daemon.solver_child import SolvedWalk
 from vad.errors import VadError
 from vad.mapping.device_stage import PlaceEstimate, place_from_posterior
-from vad.mapping.posterior import Posterior
+from vad.mapping.evidence import Terms
 
 
 class DeviceGoneError(VadError):
@@ -57,28 +57,29 @@ class Findings:
             self._doubts.pop(mac, None)
             raise DeviceGoneError("the device was forgotten meanwhile", where=mac)
 
-    async def enough(self, mac: str, posterior: Posterior) -> bool:
+    async def enough(self, mac: str, walk: Terms) -> bool:
         """Whether this much of a walk would leave the device mapped; not where it contradicts the map: what
         it says had better be sure."""
         self._still_known(mac)
-        before = await self._registry.known_posterior(mac, posterior.grid)
-        if before is None or contradicts(before, posterior):
+        before = await self._registry.known_posterior(mac, walk.grid)
+        if before is None or contradicts(before, walk.posterior(walk.grid)):
             return False
         self._still_known(mac)
-        return await self._registry.would_be_mapped(mac, posterior)
+        return await self._registry.would_be_mapped(mac, walk)
 
     async def take(self, mac: str, walk: SolvedWalk) -> Finding:
         """Judge a walk that has a posterior, and tell the registry.
 
         Raises DeviceGoneError where the device was forgotten, or found to be another one, meanwhile.
         """
-        assert walk.posterior is not None
+        posterior = walk.posterior
+        assert posterior is not None
         self._still_known(mac)
         name = self._registry.get(mac).name or mac
-        before = await self._registry.known_posterior(mac, walk.posterior.grid)
+        before = await self._registry.known_posterior(mac, posterior.grid)
         self._still_known(mac)
         doubt = self._doubts.pop(mac, None)
-        if before is None or not contradicts(before, walk.posterior):
+        if before is None or not contradicts(before, posterior):
             place = await self._add(mac, walk)
             await self._doubt(mac, on=False)
             passed = "; the walk before that said otherwise is left out" if doubt and before else ""
@@ -86,19 +87,18 @@ class Findings:
         if doubt is None or doubt.epoch != walk.epoch:
             self._doubts[mac] = _Doubt(walk, walk.epoch)
             await self._doubt(mac, on=True)
-            place = place_from_posterior(walk.posterior)
+            place = place_from_posterior(posterior)
             text = f"{name}: this walk says {self._spot(place)}, the map says {self._spot_of(mac)}: "
             return Finding("contradicts", place, text + "it is measured again before anything is changed")
         return await self._begin_anew(mac, name, doubt.walk, walk)
 
     async def _begin_anew(self, mac: str, name: str, first: SolvedWalk, second: SolvedWalk) -> Finding:
         """Two walks in a row say that it is not where it was."""
-        assert first.posterior is not None
-        assert second.posterior is not None
+        before, now = first.posterior, second.posterior
+        assert before is not None
+        assert now is not None
         was, mapped = self._spot_of(mac), self._registry.get(mac).state == "mapped"
-        agree = first.posterior.grid == second.posterior.grid and not contradicts(
-            first.posterior, second.posterior
-        )
+        agree = before.grid == now.grid and not contradicts(before, now)
         place = await self._add(mac, first if agree else second, anew=True)
         if agree:
             place = await self._add(mac, second)
@@ -112,9 +112,8 @@ class Findings:
         return Finding("moved", place, f"{text}; what was known of the old place is dropped")
 
     async def _add(self, mac: str, walk: SolvedWalk, *, anew: bool = False) -> PlaceEstimate:
-        assert walk.posterior is not None
-        add = self._registry.add_evidence
-        place = await add(mac, walk.posterior, walk.packets, walk.walk_s, anew=anew)
+        assert walk.terms is not None
+        place = await self._registry.add_evidence(mac, walk.terms, walk.packets, walk.walk_s, anew=anew)
         self._still_known(mac)
         return place
 

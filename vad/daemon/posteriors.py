@@ -1,19 +1,51 @@
-"""Posteriors as the store keeps them."""
+"""What walks say of a device, as the store keeps it."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from vad.mapping.evidence import Terms
+from vad.mapping.plan_match import PlanTransform
 from vad.mapping.posterior import Grid, Posterior
+from vad.mapping.reanchor import moved_posterior
 from vad.store.records import PosteriorRecord
 
 
-def posterior_of(stored: PosteriorRecord) -> Posterior:
-    """A stored posterior as one to compute with."""
+def terms_of(stored: PosteriorRecord) -> Terms:
+    """A stored posterior as terms to compute with."""
     rows, columns = stored.log_posterior.shape
     half = stored.step_m / 2
     grid = Grid(stored.bounds_m[0] + half, stored.bounds_m[1] + half, stored.step_m, columns, rows)
-    return Posterior(grid, stored.log_posterior.astype(np.float64))
+    told = stored.log_posterior.astype(np.float64).ravel()
+    heard = np.zeros_like(told) if stored.log_heard is None else stored.log_heard.astype(np.float64).ravel()
+    height = None if stored.height is None else np.array(stored.height)
+    return Terms(grid, stored.walks, told, heard, height=height)
+
+
+def stored_terms(mac: str, epoch: int, terms: Terms, updated_at: str) -> PosteriorRecord:
+    """Compact terms as the store keeps them. updated_at: RFC 3339."""
+    shape = terms.grid.rows, terms.grid.columns
+    return PosteriorRecord(
+        mac,
+        epoch,
+        outer_edges(terms.grid),
+        terms.grid.step_m,
+        terms.walks,
+        (terms.doppler - terms.doppler.max()).astype(np.float32).reshape(shape),
+        updated_at,
+        terms.heard.astype(np.float32).reshape(shape),
+        None if terms.height is None else tuple(terms.height.tolist()),
+    )
+
+
+def moved_terms(terms: Terms, transform: PlanTransform, grid: Grid) -> Terms:
+    """Compact terms on a grid of the new frame."""
+    shape = terms.grid.rows, terms.grid.columns
+    told, heard = (
+        moved_posterior(Posterior(terms.grid, part.reshape(shape)), transform, grid).log_density.ravel()
+        for part in (terms.doppler, terms.heard)
+    )
+    return Terms(grid, terms.walks, told, heard, height=terms.height)
 
 
 def outer_edges(grid: Grid) -> tuple[float, float, float, float]:

@@ -14,7 +14,7 @@ from vad.bus.node import Bus, now_rfc3339
 from vad.config import Settings
 from vad.daemon.device_message import device_message
 from vad.daemon.floor import moved_estimate
-from vad.daemon.posteriors import outer_edges, posterior_of
+from vad.daemon.posteriors import moved_terms, stored_terms, terms_of
 from vad.daemon.roster import Roster
 from vad.daemon.verdict import another_walk, verdict
 from vad.devices.device import Device
@@ -22,10 +22,9 @@ from vad.devices.station import StationEvent
 from vad.errors import VadError
 from vad.mac import normal_mac
 from vad.mapping.device_stage import PlaceEstimate, place_from_posterior
-from vad.mapping.evidence import joint_posterior
+from vad.mapping.evidence import Terms
 from vad.mapping.plan_match import IDENTITY, PlanTransform
 from vad.mapping.posterior import Grid, Posterior
-from vad.mapping.reanchor import moved_posterior
 from vad.robot.floor_plan import FloorPlan
 from vad.solve import on_plan, plan_prior
 from vad.store.records import DeviceRecord, Estimate, PosteriorRecord
@@ -162,15 +161,24 @@ class Registry:
         device = self.roster.known(mac)
         if not on and self.roster.table.in_settings(device):
             raise VadError(f"the settings ignore {mac}", remedy="Take it out of devices.ignore there")
-        device = await self.roster.change(device.mac, ignored=on)
+        await self._heed(await self.roster.change(device.mac, ignored=on))
+
+    async def _heed(self, device: Device) -> None:
+        """Show the device or not, as it is ignored or no more; its name may have changed."""
         if self.roster.ignores(device.mac):
-            self._devices.pop(device.mac, None)
-            self._bus.forget_device(device.mac)
-        elif device.mac not in self._devices:
-            record = await self._store.device(device.mac)
-            if record is not None:
-                self._devices[device.mac] = record
-            await self._describe([device])
+            if self._devices.pop(device.mac, None) is not None:
+                self._bus.forget_device(device.mac)
+            return
+        if device.mac not in self._devices and (record := await self._store.device(device.mac)) is not None:
+            self._devices[device.mac] = record
+        await self._describe([device])
+
+    async def use_settings(self, settings: Settings) -> None:
+        """Go on with other limits, names and ignored devices."""
+        self._settings = settings
+        self.roster.use_lists(settings.devices)
+        for device in self.roster.table.all():
+            await self._heed(device)
 
     async def rename(self, mac: str, name: str) -> None:
         """Give a known device a name, an empty one takes it away; VadError where that cannot be."""
@@ -213,9 +221,8 @@ class Registry:
                 if moved != record:
                     await self._keep(moved)
                 continue
-            grid = Grid.over(plan.bounds_m, stored.step_m)
-            density = moved_posterior(posterior_of(stored), transform, grid).log_density.astype(np.float32)
-            stored = replace(stored, epoch=plan.epoch, bounds_m=outer_edges(grid), log_posterior=density)
+            terms = moved_terms(terms_of(stored), transform, Grid.over(plan.bounds_m, stored.step_m))
+            stored = stored_terms(record.mac, plan.epoch, terms, stored.updated_at)
             await self._keep(moved, stored)
             self._publish_heatmap(stored)
 
@@ -250,9 +257,8 @@ class Registry:
 
     async def known_posterior(self, mac: str, grid: Grid) -> Posterior | None:
         """What all walks so far say together; None where nothing of this map epoch is known."""
-        known = self._devices[mac]
-        before = await self._posterior_of(known, grid)
-        return None if before is None else joint_posterior(before, known.walks)
+        before = await self._terms_of(self._devices[mac], grid)
+        return None if before is None else before.posterior(grid)
 
     async def doubt(self, mac: str, *, on: bool) -> None:
         """Say, or say no more, that the last walk contradicts the map."""
@@ -280,41 +286,38 @@ class Registry:
         """The room of a place of the present map."""
         return self._plan.room_at(x_m, y_m)
 
-    def _joint(self, total: Posterior, walks: int) -> Posterior:
-        """All walks and the floor plan together, from the product of `walks` walks."""
+    def _joint(self, total: Terms) -> Posterior:
+        """All walks and the floor plan together."""
         if total.grid not in self._priors:
             self._priors[total.grid] = plan_prior(self._plan, total.grid)
-        return on_plan(joint_posterior(total, walks), self._priors[total.grid])
+        return on_plan(total.posterior(total.grid), self._priors[total.grid])
 
-    async def would_be_mapped(self, mac: str, evidence: Posterior) -> bool:
+    async def would_be_mapped(self, mac: str, evidence: Terms) -> bool:
         """Whether this much of a walk would make the device a mapped one."""
-        known = self._devices[mac]
-        before = await self._posterior_of(known, evidence.grid)
-        total = evidence if before is None else before.fused(evidence)
-        walks = 1 if before is None else known.walks + 1
-        place = place_from_posterior(self._joint(total, walks))
+        before = await self._terms_of(self._devices[mac], evidence.grid)
+        total = evidence if before is None else before.plus(evidence)
+        place = place_from_posterior(self._joint(total))
         enough = place.status == "located" and place.radius90_m <= self._settings.capture.mapped_radius_m
-        return enough and walks >= self._settings.capture.min_walks
+        return enough and total.walks >= self._settings.capture.min_walks
 
     async def add_evidence(
-        self, mac: str, evidence: Posterior, packets: int, walk_s: float, *, anew: bool = False
+        self, mac: str, evidence: Terms, packets: int, walk_s: float, *, anew: bool = False
     ) -> PlaceEstimate:
-        """Multiply one walk's posterior into what is known; decide whether that makes a mapped device.
+        """Add one walk's (compact) terms to what is known; decide whether that makes a mapped device.
 
         anew: what was known before is dropped.
         """
         known = self._devices[mac]
-        before = None if anew else await self._posterior_of(known, evidence.grid)
-        fresh = before is None
-        total = evidence if before is None else before.fused(evidence)
-        walks = 1 if fresh else known.walks + 1
-        posterior = self._joint(total, walks)
+        before = None if anew else await self._terms_of(known, evidence.grid)
+        total = evidence if before is None else before.plus(evidence)
+        walks = total.walks
+        posterior = self._joint(total)
         place = place_from_posterior(posterior)
         was_mapped = not anew and known.state == "mapped"
         state, reason = verdict(
             self._settings.capture, self._plan, place, walks, posterior, was_mapped=was_mapped
         )
-        counts = {} if fresh else known.evidence
+        counts = {} if before is None else known.evidence
         record = replace(
             known,
             state=state,
@@ -325,18 +328,10 @@ class Registry:
                 "packets": counts.get("packets", 0.0) + packets,
                 "walk_s": round(counts.get("walk_s", 0.0) + walk_s, 1),
             },
-            estimate=self._estimate(place),
+            estimate=self._estimate(place, total.height_range_m()),
             updated_at=now_rfc3339(),
         )
-        stored = PosteriorRecord(
-            mac,
-            self._plan.epoch,
-            outer_edges(total.grid),
-            total.grid.step_m,
-            walks,
-            total.log_density.astype(np.float32),
-            record.updated_at,
-        )
+        stored = stored_terms(mac, self._plan.epoch, total, now_rfc3339())
         await self._keep(record, stored)
         self._publish_heatmap(stored)
         if state == "mapped" and known.state != "mapped":
@@ -350,18 +345,18 @@ class Registry:
             return ""
         return f"measured on map epoch {record.epoch}, the map is now epoch {self._plan.epoch}"
 
-    async def _posterior_of(self, known: DeviceRecord, grid: Grid) -> Posterior | None:
-        """What earlier walks said, where it is of the same map epoch."""
+    async def _terms_of(self, known: DeviceRecord, grid: Grid) -> Terms | None:
+        """What earlier walks said, where it is of the same map epoch; on `grid`."""
         stored = await self._store.posterior(known.mac)
         if stored is None or stored.epoch != self._plan.epoch:
             return None
-        before = posterior_of(stored)
+        before = terms_of(stored)
         same = (before.grid.rows, before.grid.columns) == (grid.rows, grid.columns)
         if not same or not np.allclose(before.grid.bounds_m, grid.bounds_m):
-            return moved_posterior(before, IDENTITY, grid)  # the plan has grown since
-        return Posterior(grid, before.log_density)
+            return moved_terms(before, IDENTITY, grid)  # the plan has grown since
+        return replace(before, grid=grid)
 
-    def _estimate(self, place: PlaceEstimate) -> Estimate:
+    def _estimate(self, place: PlaceEstimate, height90_m: tuple[float, float] | None) -> Estimate:
         (a, b), (_, c) = place.covariance_m2.tolist()
         outline = place.region90_m[0] if place.region90_m else np.empty((0, 2))
         return Estimate(
@@ -372,6 +367,7 @@ class Registry:
             tuple((float(x), float(y)) for x, y in outline),
             self._plan.room_at(float(place.xy_m[0]), float(place.xy_m[1])),
             METHOD,
+            height90_m,
         )
 
     async def _keep(self, record: DeviceRecord, posterior: PosteriorRecord | None = None) -> None:
@@ -391,7 +387,7 @@ class Registry:
         )
 
     def _publish_heatmap(self, stored: PosteriorRecord) -> None:
-        p = self._joint(posterior_of(stored), stored.walks).probability
+        p = self._joint(terms_of(stored)).probability
         self._bus.publish_heatmap(
             m.heatmap_message(
                 p,

@@ -18,8 +18,9 @@ import cv2
 import msgspec
 
 from vad.errors import SessionError
-from vad.mapping.posterior import Posterior
-from vad.solve import solve_session
+from vad.mapping.evidence import Terms
+from vad.mapping.posterior import Grid, Posterior
+from vad.solve import GRID_STEP_M, bounds_of, solve_session
 
 NICE = 5
 """Seeing goes before solving: frames that are left out are lost, a place may come some seconds later."""
@@ -35,26 +36,32 @@ class SolveRequest(msgspec.Struct, frozen=True):
 class SolvedWalk:
     """What a session says of its device, without its packets.
 
-    status, reason, posterior: of the evidence (vad.mapping.device_stage), posterior None where refused;
-    packets: of the device; walk_s: the walk's length; epoch: of the map.
+    status, reason: of the evidence (vad.mapping.device_stage); terms: compact, None where refused; packets:
+    of the device; walk_s: the walk's length; epoch: of the map.
     """
 
     status: str
     reason: str
-    posterior: Posterior | None
+    terms: Terms | None
     packets: int
     walk_s: float
     epoch: int
+
+    @property
+    def posterior(self) -> Posterior | None:
+        """What this walk alone says."""
+        return None if self.terms is None else self.terms.posterior(self.terms.grid)
 
 
 def solved_walk(folder: Path) -> SolvedWalk:
     """Solve a session folder here and now; about a second of work. Raises SessionError."""
     solved = solve_session(folder)
     session, evidence = solved.session, solved.evidence
+    grid = Grid.over(bounds_of(session), GRID_STEP_M)
     return SolvedWalk(
         evidence.status,
         evidence.reason,
-        evidence.posterior,
+        None if evidence.terms is None else evidence.terms.compact(grid),
         len(session.t_ns),
         float(session.walk_t_ns[-1] - session.walk_t_ns[0]) / 1e9,
         session.header.map.epoch,

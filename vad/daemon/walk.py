@@ -248,9 +248,7 @@ class WalkRecorder:
             for mac, folder in zip(self.macs, self.writer.folders, strict=True):
                 try:
                     solved = await self._solver.solve(folder)
-                    sharp = solved.posterior is not None and await self._findings.enough(
-                        mac, solved.posterior
-                    )
+                    sharp = solved.terms is not None and await self._findings.enough(mac, solved.terms)
                 except (SessionError, DeviceGoneError) as error:
                     _log.debug("%s is not ready yet: %s", folder, error)
                     sharp = False

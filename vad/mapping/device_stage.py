@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -13,6 +13,7 @@ from vad.mapping.arrival_likelihood import arrival_sums
 from vad.mapping.doppler_likelihood import SPEED_OF_LIGHT_MPS, DopplerModel, log_heard
 from vad.mapping.doppler_search import OFFSETS_S, DopplerSearch
 from vad.mapping.evidence import Terms
+from vad.mapping.height import height_log_likelihood
 from vad.mapping.paper import THRESHOLD_OFFICE_M, algorithm_1
 from vad.mapping.posterior import Grid, Posterior
 from vad.mapping.walk import WalkTrack
@@ -163,7 +164,9 @@ def _terms(
     sums = None
     if phases is not None:
         sums = arrival_sums(phases, walk, points, wavelength_m=search.wavelength_m)
-    return Terms(grid, 1, doppler, log_heard(points, walk), sums)
+    terms = Terms(grid, 1, doppler, log_heard(points, walk), sums)
+    height = height_log_likelihood(search, points, terms.log_density(), doppler, offset_s)
+    return replace(terms, height=height)
 
 
 def place_from_posterior(posterior: Posterior) -> PlaceEstimate:

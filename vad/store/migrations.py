@@ -79,5 +79,11 @@ MIGRATIONS: tuple[str, ...] = (
         shared INTEGER NOT NULL DEFAULT 0
     ) WITHOUT ROWID;
     """,
+    """
+    ALTER TABLE posteriors ADD COLUMN log_heard BLOB;
+    ALTER TABLE posteriors ADD COLUMN heights TEXT;
+    ALTER TABLE devices ADD COLUMN height_low_m REAL;
+    ALTER TABLE devices ADD COLUMN height_high_m REAL;
+    """,
 )
 """Step i leads from version i to i + 1."""

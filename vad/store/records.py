@@ -13,7 +13,8 @@ Covariance = tuple[tuple[float, float], tuple[float, float]]
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Where a device is: map frame of `epoch`, metres; region90: outline of the 90 % region."""
+    """Where a device is: map frame of `epoch`, metres; region90: outline of the 90 % region; height90_m:
+    lowest and highest above the floor, where that is told."""
 
     x_m: float
     y_m: float
@@ -22,6 +23,7 @@ class Estimate:
     region90: tuple[tuple[float, float], ...] = ()
     room: str | None = None
     method: str = ""
+    height90_m: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,10 +44,11 @@ class DeviceRecord:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosteriorRecord:
-    """A device's posterior over the map.
+    """What walks say of a device all over the map: vad.mapping.evidence.Terms, kept.
 
-    log_posterior: (height, width) float32, natural logarithm, row 0 at y0. bounds_m: x0, y0, x1, y1 of the
-    outer cell edges. step_m: the cells' side. walks: how many walks it holds.
+    log_posterior, log_heard: (rows, columns) float32, natural logarithm, row 0 at y0; log_heard None: it is
+    in log_posterior. bounds_m: x0, y0, x1, y1 of the outer cell edges. step_m: the cells' side. walks: how
+    many walks it holds. height: log-likelihoods of heights, None where none was told.
     """
 
     mac: str
@@ -55,6 +58,8 @@ class PosteriorRecord:
     walks: int
     log_posterior: NDArray[np.float32]
     updated_at: str
+    log_heard: NDArray[np.float32] | None = None
+    height: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)
