@@ -6,17 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from home_walks import recordings
 
-from vad.mapping.device_stage import Evidence, Recording, evidence_from_walk
+from vad.mapping.device_stage import Evidence, evidence_from_walk
 from vad.mapping.evidence import Terms
 from vad.mapping.height import OFF_TORSO_M, height_range_m
 from vad.mapping.posterior import Grid
-from vad.mapping.walk import WalkTrack
-from vad.sim.radio import OTHER_MAC, Radio
-from vad.sim.scenario import CARRIER_HZ, make_home
-from vad.sim.track_error import true_places_m
+from vad.sim.scenario import make_home
 
 TORSO_M = 0.95
+SEED = 3
 
 
 def test_what_no_walk_tells_is_not_told() -> None:
@@ -40,31 +39,18 @@ def test_above_and_below_are_not_told_apart() -> None:
     assert height_range_m(-(((OFF_TORSO_M - 0.8) / 0.05) ** 2), TORSO_M) is None
 
 
-def solved(seed: int, *, anchor_known: bool = True) -> tuple[list[Evidence], float]:
-    home = make_home(seed, walks=2)
-    radio = Radio(home, seed=seed)
-    found = []
-    for walk in home.walks:
-        batch = radio.generate(walk.start_s, walk.end_s)
-        mine = batch.mac != OTHER_MAC
-        parts = batch.csi[mine].astype(np.float32)
-        t_s = np.arange(walk.start_s, walk.end_s, 0.05)
-        places_m = true_places_m(walk, t_s)
-        recording = Recording(
-            np.rint(batch.t_s[mine] * 1e9).astype(np.int64),
-            parts[..., 0] + 1j * parts[..., 1],
-            WalkTrack(np.rint(t_s * 1e9).astype(np.int64), places_m, np.full(len(t_s), 0.02)),
-            np.array(home.anchor_m[:2]),
-            home.anchor_m[2] if anchor_known else None,
-            CARRIER_HZ,
-            array_end="anchor",
-        )
-        found.append(evidence_from_walk(recording, Grid.over(home.room_m, 0.2), offsets_s=(0.0,)))
+def solved(*, anchor_known: bool = True) -> tuple[list[Evidence], float]:
+    home = make_home(SEED, walks=2)
+    grid = Grid.over(home.room_m, 0.2)
+    found = [
+        evidence_from_walk(walk if anchor_known else replace(walk, anchor_z_m=None), grid, offsets_s=(0.0,))
+        for walk in recordings(home, SEED)
+    ]
     return found, float(home.device_m[2])
 
 
 def test_walks_by_a_device_bound_its_height() -> None:
-    walks, height_m = solved(3)
+    walks, height_m = solved()
     first, second = (walk.terms for walk in walks)
     assert isinstance(first, Terms)
     assert isinstance(second, Terms)
@@ -76,7 +62,7 @@ def test_walks_by_a_device_bound_its_height() -> None:
 
 
 def test_without_the_hubs_height_there_is_none() -> None:
-    walks, _ = solved(3, anchor_known=False)
+    walks, _ = solved(anchor_known=False)
     terms = walks[0].terms
     assert terms is not None
     assert terms.height is None
