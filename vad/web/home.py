@@ -20,7 +20,7 @@ Theme = Literal["light", "dark"]
 
 _FREE, _WALL = (
     {"light": (255, 255, 255), "dark": (31, 39, 48)},
-    {"light": (57, 66, 78), "dark": (139, 152, 167)},
+    {"light": (57, 66, 78), "dark": (112, 125, 140)},
 )
 """Colours (RGB) of floor and walls; what the robot has not seen is clear."""
 _SHOWN = {"status", "map", "camera", "device", "capture"}

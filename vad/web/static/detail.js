@@ -3,7 +3,7 @@
 import { account, onAccount, wish } from "./account.js";
 import { bdi, byId, el, setText } from "./dom.js";
 import { all, one, onChange } from "./store.js";
-import { ago, CAPTURES, counted, duration, exactly, metres, nameOf, plusMinus, printable, sentence, STATES, whyWords } from "./words.js";
+import { ago, CAPTURES, counted, duration, exactly, metres, nameOf, printable, sentence, STATES, whyWords } from "./words.js";
 
 let shown = null;
 let close = () => {};
@@ -97,7 +97,7 @@ function facts(device) {
   const add = (term, value, title) => value && rows.push([term, value, title]);
   if (device.x_m !== null && device.x_m !== undefined) {
     add("Place", `x ${device.x_m.toFixed(2)} m, y ${device.y_m.toFixed(2)} m`);
-    if (device.radius90_m !== null) add("90 % within", plusMinus(device.radius90_m));
+    if (device.height90_m) add("Height", `${device.height90_m.map(metres).join(" to ")} above the floor`);
   }
   if (device.walks) {
     const { walk_s: seconds, packets } = device.evidence ?? {};

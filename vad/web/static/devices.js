@@ -42,13 +42,13 @@ class Row {
     this.note = el("span", { class: "note" });
     this.mark = el("span", { class: "dot", "aria-hidden": "true" });
     this.state = el("span", { class: "unseen" });
-    const main = el("span", { class: "row-main" }, el("span", { class: "row-name" }, this.name, " ", this.state), this.note);
+    const main = el("span", { class: "row-main row-name" }, el("span", {}, this.name, this.state));
     this.place = el("span", { class: "row-place" });
     this.button = el("button", {
       type: "button", class: "row", click: () => choose(mac),
       pointerenter: () => point(mac, true), pointerleave: () => point(mac, false),
       focus: () => point(mac, true), blur: () => point(mac, false),
-    }, this.mark, main, this.place);
+    }, this.mark, main, this.place, this.note);
     this.node = el("li", {}, this.button);
     this.group = -1;
     this.sort = "";
@@ -62,7 +62,7 @@ class Row {
     setText(this.name, name);
     setText(this.state, `, ${state.word}`);
     setAttribute(this.mark, "class", `dot ${device.state}`);
-    setText(this.place, state.group === 2 ? whereWords(device) : "");
+    setText(this.place, whereWords(device));
     setText(this.note, state.group === 2 ? (device.moved ? whyWords(device) : "") : whyWords(device));
     setAttribute(this.button, "class", device.in_network ? "row" : "row away");
     this.words = [name, device.mac, device.room, device.host_name, device.vendor, device.ip, ...(device.macs ?? [])]
@@ -118,7 +118,7 @@ function headings() {
   byId("none").hidden = rows.size > 0;
   byId("search-row").hidden = rows.size < SEARCH_FROM && !wanted;
   setText(byId("count"), rows.size ? String(rows.size) : "");
-  const told = [`${counts[2]} of ${counted(rows.size, "device")} on the map`];
+  const told = [`${counts[2]} of ${counted(rows.size, "device")} mapped`];
   if (counts[0]) told.push(`${counts[0]} being measured`);
   setText(byId("summary"), rows.size ? told.join(" · ") : "");
 }

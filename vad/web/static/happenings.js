@@ -5,7 +5,7 @@ import { all, one, onChange } from "./store.js";
 import { ago, CAPTURES, counted, duration, exactly, metres, nameOf, printable, sentence } from "./words.js";
 
 const SHOWN = 50;
-const KINDS = { joined: "Joined", mapped: "On the map", moved: "Moved", lost: "Lost" };
+const KINDS = { joined: "Joined", mapped: "Mapped", moved: "Moved", lost: "Lost" };
 const seen = new Set(); // events that were there when the page was opened are not read out
 let settled = false;
 

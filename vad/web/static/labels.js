@@ -17,13 +17,11 @@ function widthOf(text) {
 
 /**
  * Place labels in turn, the first come first served.
- * wanted: {x, y, text, must} in pixels; taken: further [x, y] to keep free. Returns for each the {x, y, anchor}
- * of its text's baseline, or null where there is no room.
+ * wanted: {x, y, text, must} in pixels; taken: boxes [left, top, right, bottom] to keep free. Returns for each
+ * the {x, y, anchor} of its text's middle, or null where there is no room.
  */
 export function place(wanted, taken, width, height) {
-  const boxes = [...wanted.map(({ x, y }) => [x, y]), ...taken].map(([x, y]) => [
-    x - POINT_PX, y - POINT_PX, x + POINT_PX, y + POINT_PX,
-  ]);
+  const boxes = [...wanted.map(({ x, y }) => around(x, y)), ...taken];
   const points = wanted.length;
   const found = new Array(points).fill(null);
   wanted.forEach(({ x, y, text, must }, i) => {
@@ -52,5 +50,8 @@ export function place(wanted, taken, width, height) {
   });
   return found;
 }
+
+/** The box that a point's mark needs. */
+export const around = (x, y) => [x - POINT_PX, y - POINT_PX, x + POINT_PX, y + POINT_PX];
 
 const overlap = (a, b) => a[0] < b[2] && b[0] < a[2] && a[1] < b[3] && b[1] < a[3];

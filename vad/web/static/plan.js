@@ -1,7 +1,7 @@
 // The floor plan: what lies in metres is in the group `world`, what keeps its size in the group `overlay`.
 
 import { byId, setAttribute, setText, svg } from "./dom.js";
-import { place } from "./labels.js";
+import { around, place } from "./labels.js";
 import { all, mark, one, onChange } from "./store.js";
 import { View } from "./view.js";
 import { counted, nameOf, plusMinus, printable, STATES } from "./words.js";
@@ -92,6 +92,8 @@ function drawMap() {
     layers.rooms.append(svg("polygon", { points: points(room.polygon_m), class: `tint${i % 6}` }));
     layers.roomNames.append(svg("text", { class: "room", text: printable(room.name) }));
   });
+  const [x0, y0, x1, y1] = map.bounds_m;
+  byId("plan").parentElement.style.setProperty("--shape", (y1 - y0) / Math.max(x1 - x0, 0.1));
   view.show(map.bounds_m);
   drawRoomNames();
 }
@@ -271,7 +273,11 @@ function drawLabels() {
     return { x, y, text, must: mac === selected, nodes };
   });
   wanted.sort((a, b) => Number(b.must) - Number(a.must) || (a.text < b.text ? -1 : 1));
-  const taken = [...cameras.keys()].map((id) => view.px(...one("camera", id).position_m.slice(0, 2)));
+  const taken = [...cameras.keys()].map((id) => around(...view.px(...one("camera", id).position_m.slice(0, 2))));
+  for (const text of layers.roomNames.children) {
+    const box = text.getBBox();
+    taken.push([box.x, box.y, box.x + box.width, box.y + box.height]);
+  }
   const found = place(wanted, taken, view.width, view.height);
   wanted.forEach(({ nodes, text }, i) => {
     const at = found[i];

@@ -2,7 +2,7 @@
 
 const MIN_PX_PER_M = 4;
 const MAX_PX_PER_M = 600;
-const FIT_PAD_PX = 26;
+const FIT_PAD_PX = { side: 26, top: 26, bottom: 60 }; // the buttons stand at the bottom
 const STEP = 1.35;
 const CLICK_PX = 5;
 
@@ -50,10 +50,11 @@ export class View {
     const [x0, y0, x1, y1] = this.bounds;
     const across = Math.max(x1 - x0, 0.5);
     const up = Math.max(y1 - y0, 0.5);
-    const free = (size) => Math.max(size - 2 * FIT_PAD_PX, 40);
-    this.scale = limited(Math.min(free(this.width) / across, free(this.height) / up));
+    const { side, top, bottom } = FIT_PAD_PX;
+    const free = [this.width - 2 * side, this.height - top - bottom].map((size) => Math.max(size, 40));
+    this.scale = limited(Math.min(free[0] / across, free[1] / up));
     this.x = (x0 + x1) / 2;
-    this.y = (y0 + y1) / 2;
+    this.y = (y0 + y1) / 2 - (bottom - top) / 2 / this.scale;
     this.drawn();
   }
 

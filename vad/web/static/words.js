@@ -5,11 +5,11 @@ export const STATES = {
   capturing: { word: "Being measured", group: 0, sentence: "It is being measured right now." },
   waiting: { word: "Waiting", group: 1, sentence: "It waits to be measured." },
   discovered: { word: "New", group: 1, sentence: "It has joined the network and was not measured yet." },
-  failed: { word: "Not sharp", group: 1, sentence: "It could not be placed well enough." },
+  failed: { word: "Unsure", group: 1, sentence: "It could not be placed well enough." },
   stale: { word: "Out of date", group: 1, sentence: "What was measured no longer holds." },
-  mapped: { word: "On the map", group: 2, sentence: "" },
+  mapped: { word: "Mapped", group: 2, sentence: "" },
 };
-export const GROUPS = ["Being measured", "Not settled yet", "On the map"];
+export const GROUPS = ["Being measured", "Not sure yet", "Mapped"];
 
 export const CAPTURES = {
   idle: "gets ready",
