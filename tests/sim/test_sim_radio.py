@@ -122,7 +122,7 @@ def simulated_ridge(seed: int) -> Ridge:
 @pytest.mark.parametrize("seed", [0, 1, 2, 3, 4])
 def test_doppler_follows_the_walker(seed: int, record_property: Callable[[str, object], None]) -> None:
     ridge = simulated_ridge(seed)
-    record_property("ridge", ridge)
+    record_property("ridge", str(ridge))
     assert ridge.error_mps < 0.15
     assert ridge.sign > 0.95
     assert ridge.mirror_db > 6
@@ -141,7 +141,7 @@ def test_real_recordings_have_the_same_sign_and_shape(
     step_s = float(np.median(np.diff(track[:, 0]))) * 1e-9
     truth = path_change(track[:, 1:3], step_s, np.array([0.0, 0, 1]), np.array([*device.values(), 1.0]), 1.0)
     ridge = judge(t_s, packets.csi[:, :, :, 0], track[:, 0] * 1e-9, truth)
-    record_property("ridge", ridge)
+    record_property("ridge", str(ridge))
     assert ridge.error_mps < 0.25
     assert ridge.sign > 0.9
     assert ridge.mirror_db > 6
