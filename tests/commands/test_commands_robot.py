@@ -21,8 +21,8 @@ from vad.bus import messages as m
 from vad.bus.grid import grid_to_png
 from vad.bus.node import Bus
 from vad.bus.session import BusSettings
-from vad.commands import doctor as doctor_module
 from vad.commands.app import app
+from vad.commands.doctor import robot as doctor_robot
 from vad.config import load_settings
 from vad.robot.map_server import load_floor_plan
 from vad.sim.neato import VirtualNeato
@@ -131,20 +131,18 @@ def test_doctor_finds_nothing_wrong(tmp_path: Path, floor: dict[str, str]) -> No
     link = tmp_path / "tty"
     config = settings(tmp_path, {"type": "neato", "port": str(link)}, map=floor)
     with neato(link):
-        told = run("doctor", "--config", config).stdout
+        told = run("doctor", "--config", config, "--only", "map", "--only", "robot").stdout
     assert told.count("✓") == 3
     assert "1 rooms" in told
+    assert "nothing is wrong" in told
 
 
 def test_doctor_on_a_port_that_is_missing_and_a_plan_that_is_none(tmp_path: Path) -> None:
     robot = {"type": "neato", "port": str(tmp_path / "nothing")}
     config = settings(tmp_path, robot, map={"file": "floor.yaml"})
-    found = json.loads(run("doctor", "--config", config, "--listen", "0.5", "--json", code=1).stdout)
-    assert {(f["check"], f["verdict"]) for f in found} == {
-        ("floor plan", "bad"),
-        ("serial port", "bad"),
-        ("robot", "bad"),
-    }
+    only = ("--only", "map", "--only", "robot", "--json")
+    found = json.loads(run("doctor", "--config", config, *only, code=1).stdout)
+    assert {(f["check"], f["verdict"]) for f in found} == {("floor plan", "bad"), ("serial port", "bad")}
     assert all(f["remedy"] for f in found)
 
 
@@ -154,9 +152,9 @@ def test_doctor_on_a_port_without_permission(
     port = tmp_path / "tty"
     port.touch()
     # Root may open everything: what the kernel would tell another user.
-    monkeypatch.setattr(doctor_module, "access", lambda *_: False)
+    monkeypatch.setattr(doctor_robot, "access", lambda *_: False)
     config = settings(tmp_path, {"type": "neato", "port": str(port)}, map=floor)
-    told = run("doctor", "--config", config, "--listen", "0.2", code=1).stdout
+    told = run("doctor", "--config", config, "--only", "robot", code=1).stdout
     assert "may not be read and written" in told
     assert "usermod -aG" in told
 
@@ -174,7 +172,7 @@ def test_doctor_on_a_wrong_baud_rate(tmp_path: Path, floor: dict[str, str]) -> N
     thread.start()
     config = settings(tmp_path, {"type": "neato", "port": os.ttyname(slave)}, map=floor)
     try:
-        told = run("doctor", "--config", config, "--listen", "3", code=1).stdout
+        told = run("doctor", "--config", config, "--listen", "3", "--only", "robot", code=1).stdout
     finally:
         ended.set()
         thread.join()
@@ -184,9 +182,26 @@ def test_doctor_on_a_wrong_baud_rate(tmp_path: Path, floor: dict[str, str]) -> N
     assert "baud rate" in told
 
 
+@pytest.mark.slow
+def test_doctor_on_everything_of_a_machine_that_is_no_hub(tmp_path: Path) -> None:
+    config = settings(
+        tmp_path, {"type": "neato", "port": str(tmp_path / "nothing")}, map={"file": "none.yaml"}
+    )
+    found = json.loads(run("doctor", "--config", config, "--listen", "0.3", "--json", code=1).stdout)
+    checks = {f["check"] for f in found}
+    assert checks >= {"settings", "state", "disk", "clock", "networks", "processor", "floor plan", "camera"}
+    assert all(f["remedy"] or f["verdict"] == "ok" for f in found)
+
+
+def test_doctor_knows_its_checks(tmp_path: Path) -> None:
+    config = settings(tmp_path, {"type": "neato", "port": "/dev/none"}, map={"file": "none.yaml"})
+    told = run("doctor", "--config", config, "--only", "robots", code=2).stderr
+    assert "There are settings, daemon" in told
+
+
 def test_doctor_without_router_and_without_map(tmp_path: Path) -> None:
     config = settings(tmp_path, {"type": "ros2", "endpoint": "tcp/127.0.0.1:9"})
-    told = run("doctor", "--config", config, "--listen", "0.6", code=1).stdout
+    told = run("doctor", "--config", config, "--listen", "0.6", "--only", "robot", code=1).stdout
     assert "zenoh router" in told
     assert "rmw_zenohd" in told
     assert "none came in 0.6 s" in told
@@ -204,7 +219,7 @@ def test_doctor_takes_the_map_of_the_robot(tmp_path: Path) -> None:
 
     with playing(play):
         config = settings(tmp_path, {"type": "valetudo", "url": urls[0]})
-        told = run("doctor", "--config", config).stdout
+        told = run("doctor", "--config", config, "--only", "robot").stdout
     assert "robot's map" in told
     assert told.count("✓") == 2
 
