@@ -31,7 +31,8 @@ def packet(sequence: int, ticks: int, jpeg: bytes, *, exposure_ms: float = 12.5,
 class Kinect(usb.backend.IBackend):  # type: ignore[misc]
     """The device and its bus. `plug(False)` unplugs it; `send` queues a picture once it streams.
 
-    Attributes: serial; log: what the host did, in order; streaming; busy_polls: READY says no so often.
+    Attributes: serial; log: what the host did, in order; streaming; busy_polls: READY says no so often;
+    aborts: the host did what ends its process with some versions of libusb.
     """
 
     def __init__(self, serial: str = "012345678947", product: int = 0x02C4) -> None:
@@ -41,6 +42,7 @@ class Kinect(usb.backend.IBackend):  # type: ignore[misc]
         self.streaming = threading.Event()
         self.busy_polls = 2
         self.forbidden = False
+        self.aborts = False
         self._plugged = True
         self._configured = 0
         self._suspended = True
@@ -140,6 +142,8 @@ class Kinect(usb.backend.IBackend):  # type: ignore[misc]
         self.log.append(("release", number))
 
     def set_interface_altsetting(self, handle: str, number: int, alternate: int) -> None:
+        # With the device gone libusb 1.0.26 (Debian 12) keeps a lock here, and closing aborts the process.
+        self.aborts = self.aborts or not self._plugged
         self._there()
         self.log.append(("alternate", number, alternate))
 

@@ -146,10 +146,13 @@ class _Link:
         self._suspend(True)
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, kind: object, *error: object) -> None:
         # What can still be told it is told, so that the next opening finds it at rest.
         with contextlib.suppress(usb.core.USBError, SourceError):
-            self._device.set_interface_altsetting(1, 0)
+            # After an error it may be gone, and then libusb 1.0.26 (Debian 12) keeps a lock in this call and
+            # aborts the whole process when the device is closed. The kernel does the same at closing.
+            if kind is None:
+                self._device.set_interface_altsetting(1, 0)
             for command in kinect2.CLOSING:
                 self._ask(command)
             self._suspend(True)
