@@ -45,7 +45,7 @@ class Row {
     const main = el("span", { class: "row-main row-name" }, el("span", {}, this.name, this.state));
     this.place = el("span", { class: "row-place" });
     this.button = el("button", {
-      type: "button", class: "row", click: () => choose(mac),
+      type: "button", class: "row", "data-mac": mac, click: () => choose(mac),
       pointerenter: () => point(mac, true), pointerleave: () => point(mac, false),
       focus: () => point(mac, true), blur: () => point(mac, false),
     }, this.mark, main, this.place, this.note);
