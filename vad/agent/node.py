@@ -31,6 +31,9 @@ class Node:
         batch_s: packets are collected for this long into one message.
         buffer_bytes: how much may wait for the hub; beyond, the oldest is dropped and counted.
         transmitter: packets known to be of somebody else are left out.
+
+    Attributes:
+        batches: what the card has sent and is not collected yet.
     """
 
     def __init__(
@@ -48,24 +51,24 @@ class Node:
             info, source.health, stream=stream, limit_bytes=buffer_bytes, transmitter=transmitter
         )
         self.link = HubLink(bus, info, self.collector)
+        self.batches: DropOldestQueue[CsiBatch] = DropOldestQueue(QUEUED_BATCHES)
         self._source = source
         self._batch_s = batch_s
 
     async def run(self) -> None:
         """Collect and send until cancelled."""
-        batches: DropOldestQueue[CsiBatch] = DropOldestQueue(QUEUED_BATCHES)
         async with asyncio.TaskGroup() as group:
-            group.create_task(self._source.run(batches), name="csi")
-            group.create_task(self._collect(batches), name="collect")
+            group.create_task(self._source.run(self.batches), name="csi")
+            group.create_task(self._collect(), name="collect")
             group.create_task(self._tick(), name="tick")
             group.create_task(self.link.run(), name="link")
             group.create_task(self._say(), name="say")
 
-    async def _collect(self, batches: DropOldestQueue[CsiBatch]) -> None:
+    async def _collect(self) -> None:
         while True:
-            first = await batches.get()
+            first = await self.batches.get()
             await asyncio.sleep(self._batch_s)
-            self.collector.take([first, *batches.drain()], time.monotonic_ns())
+            self.collector.take([first, *self.batches.drain()], time.monotonic_ns())
             self.link.wake()
 
     async def _tick(self) -> None:

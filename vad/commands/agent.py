@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import faulthandler
 import logging
 import os
 import socket
@@ -21,6 +22,7 @@ from vad.commands.signals import until_ended
 from vad.config import AgentSettings, agent_settings, parse_yaml, read_text, resolve
 from vad.csi.open_source import open_source
 from vad.daemon.notify import notify
+from vad.daemon.watchdog import Watchdog, feed, feed_every_s
 from vad.errors import ConfigError
 from vad.mac import mac_from_text, normal_mac
 from vad.pki.credentials import ENVIRONMENT, load_credentials
@@ -86,6 +88,7 @@ def agent(
         if check:
             out.print(f"the settings are usable (agent {settings.id!r} of {settings.hub})", markup=False)
             return
+        faulthandler.enable()
         asyncio.run(until_ended(_run(node)))
 
 
@@ -141,8 +144,13 @@ def _node(settings: AgentSettings, config_file: Path) -> Node:
 
 
 async def _run(node: Node) -> None:
+    watchdog = Watchdog(feed, every_s=feed_every_s())
+    watchdog.add_queue("the card's packets wait and are not collected", node.batches)
+    feeding = asyncio.create_task(watchdog.run(), name="watchdog")
     notify("READY=1")
     try:
         await node.run()
     finally:
         notify("STOPPING=1")
+        feeding.cancel()
+        await asyncio.wait({feeding})

@@ -45,6 +45,7 @@ from vad.daemon.page import page_access, web_page
 from vad.daemon.parts import Parts
 from vad.daemon.past import StoredPast
 from vad.daemon.registry import Registry
+from vad.daemon.service import Supervision
 from vad.daemon.wishes import Wishes
 from vad.devices.station import StationEvent
 from vad.errors import VadError
@@ -67,7 +68,7 @@ STATUS_EVERY_S = 0.5
 T = TypeVar("T")
 
 
-async def run_daemon(settings: Settings, config_file: Path) -> None:
+async def run_daemon(settings: Settings, config_file: Path, supervision: Supervision) -> None:
     """Run until cancelled; VadError where something without which nothing works is missing or breaks."""
     check_listen(settings, config_file)
     plan = None
@@ -84,11 +85,13 @@ async def run_daemon(settings: Settings, config_file: Path) -> None:
         NodeSettings(hub=settings.hub, listen=listen, connect=settings.bus.connect), source=settings.source
     )
     bus.ask_past(StoredPast(store, settings.source))
+    supervision.opening = True
     await store.open()
     try:
         await bus.open()
+        supervision.opening = False
         try:
-            daemon = Daemon(settings, config_file, state_dir, plan, network, bus, store)
+            daemon = Daemon(settings, config_file, state_dir, plan, network, bus, store, supervision)
             await daemon.run()
         finally:
             await bus.close()
@@ -108,7 +111,9 @@ class Daemon:
         network: PoseNetwork,
         bus: Bus,
         store: StoreWorker,
+        supervision: Supervision,
     ) -> None:
+        self._supervision = supervision
         self._settings = settings
         self._base = config_file.parent
         self._state_dir = state_dir
@@ -128,16 +133,15 @@ class Daemon:
         try:
             async with asyncio.TaskGroup() as group:
                 await self._start(group)
+                gc.unfreeze()  # what an earlier core has left
                 gc.collect()
                 gc.freeze()  # what is known by now is never looked through again: no pauses amid answers
-                notify("READY=1")
+                self._supervision.up()
         except ExceptionGroup as broken:
             known, unknown = broken.split(VadError)
             if unknown is not None or known is None:
                 raise
             raise _first(known) from None
-        finally:
-            notify("STOPPING=1")
 
     async def _start(self, group: asyncio.TaskGroup) -> None:
         settings = self._settings
@@ -217,6 +221,7 @@ class Daemon:
             group.create_task(page.run(), name="web")
             parts.append(page.health)
         queues: dict[str, DropOldestQueue[Any]] = {"poses": poses, "frames": frames, "csi": batches}
+        self._supervision.attend(queues, stations, captures, registry, self._store.health)
         group.create_task(
             self._tell_status([*parts, *(s.health for s in joins)], queues, captures), name="status"
         )
@@ -239,7 +244,7 @@ class Daemon:
 
     def _say_waiting(self, robot: PoseSource, step: str = "waiting for the robot's map") -> None:
         """The status while nothing else can begin: there is no floor plan, or the disk takes nothing."""
-        notify(f"READY=1\nSTATUS={step}")
+        self._supervision.up(step)
         healths = [robot.health, self._bus.health, self._store.health]
         self._publish_status(step, self._parts.tell(healths, time.monotonic()))
 
@@ -297,7 +302,10 @@ class Daemon:
         said = ""
         daemon = Health("daemon")
         while True:
-            daemon.ok(captures.step)
+            if not self._supervision.refused:
+                daemon.ok(captures.step)
+            else:
+                daemon.trouble(self._supervision.refused)
             for name, queue in queues.items():
                 daemon.counters |= {name: queue.accepted, f"dropped_{name}": queue.dropped}
             self._publish_status(captures.step, self._parts.tell([daemon, *parts], time.monotonic()))

@@ -52,7 +52,7 @@ STOPPED = "the daemon stopped"
 
 
 class Captures:
-    """The capture loop; `step` is one sentence for people about what is going on."""
+    """The capture loop; `step` is one sentence about what is going on, `turns` grows while it goes on."""
 
     def __init__(
         self,
@@ -66,6 +66,7 @@ class Captures:
         agents: Agents | None = None,
     ) -> None:
         self.step = "starting"
+        self.turns = 0
         self._settings = settings
         self._plan = plan
         self._eyes = eyes
@@ -94,6 +95,11 @@ class Captures:
         """Go on with another floor plan; a walk that began on another epoch is not used."""
         self._plan = plan
 
+    def use_settings(self, settings: Settings) -> None:
+        """Go on with other limits, those of the schedule apart; a walk that began keeps its own."""
+        self._settings = settings
+        self._measuring.use_limits(settings.capture)
+
     def joined(self, mac: str) -> None:
         """The device joined the network, for the first time or again."""
         self._measuring.joined(mac, time.monotonic_ns())
@@ -104,6 +110,7 @@ class Captures:
             await self._tidy_up()
             while True:
                 await asyncio.sleep(TICK_S)
+                self.turns += 1
                 decision = await self._decide(time.monotonic_ns())
                 await self._traffic.towards(decision.provoke)
                 if decision.record and decision.track is not None:
@@ -232,6 +239,7 @@ class Captures:
         self._say_solving(walk)
         told, useless = False, ""
         for mac, folder in zip(walk.macs, walk.writer.folders, strict=True):
+            self.turns += 1
             self.step = f"working out where {self._measuring.name(mac)} is"
             finding = None
             try:
@@ -290,6 +298,7 @@ class Captures:
             self._decisions.tell(f"{len(gone)} old sessions deleted to keep the quota, up to {gone[-1]}")
 
     def _say(self, walk: WalkRecorder) -> None:
+        self.turns += 1
         names = ", ".join(self._measuring.name(mac) for mac in walk.macs)
         self.step = f"recording a walk for {names}: {walk.seconds:.0f} s, {walk.writer.packets} packets"
         for mac in walk.macs:

@@ -33,15 +33,16 @@ def check_files(settings: Settings, config_file: Path) -> None:
 
 def check_bus(settings: Settings, config_file: Path) -> None:
     """VadError where the bus cannot listen as the settings say."""
-    for endpoint in settings.bus.listen:
-        check_endpoint(endpoint)
     check_listen(settings, config_file)
     if tls_endpoints(settings.bus.listen):
         PkiFolder(pki_folder(settings, config_file)).hub_files()
 
 
 def check_listen(settings: Settings, config_file: Path) -> None:
-    """ConfigError where nothing listens on the hub itself: its commands and the gate go through that."""
+    """VadError where an endpoint is not allowed, or nothing listens on the hub itself: its commands and the
+    gate go through that."""
+    for endpoint in settings.bus.listen:
+        check_endpoint(endpoint)
     if not local_endpoints(settings.bus.listen):
         raise ConfigError(
             "there is no endpoint for the hub itself",

@@ -63,6 +63,10 @@ class Measuring:
         self._provoked_per_s = provoked_per_s
         self._schedule = Schedule(Limits(limits.together, int(limits.recheck_h * 3600e9)))
 
+    def use_limits(self, limits: CaptureSettings) -> None:
+        """Go on with other limits; schedule and airtime stay as they began."""
+        self._limits = limits
+
     def joined(self, mac: str, now_ns: int) -> None:
         """The device joined the network, for the first time or again."""
         self._schedule.look_again(now_ns, mac)

@@ -57,6 +57,13 @@ class Roster:
         if ip is not None:
             self.table.take(StationEvent(time.monotonic_ns(), "told", mac, "settings", ip=ip), now_rfc3339())
 
+    def use_lists(self, settings: DeviceSettings) -> None:
+        """Other names, addresses and ignored devices in the settings than before."""
+        self._settings = settings
+        self.table.use_lists({device.mac: device.name for device in settings.static}, settings.ignore)
+        for listed in settings.static:
+            self._tell(normal_mac(listed.mac), listed.ip)
+
     async def adopt(self, mac: str, name: str | None, since: str) -> None:
         """Take in a device that was stored before there was a table."""
         device = Device(mac, (mac,), since, since, host_name=name)

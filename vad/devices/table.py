@@ -57,8 +57,7 @@ class DeviceTable:
         limit: int = MAX_DEVICES,
     ) -> None:
         self.refused = 0
-        self._names = {normal_mac(mac): name for mac, name in (names or {}).items()}
-        self._ignore = {normal_mac(mac) for mac in ignore}
+        self.use_lists(names or {}, ignore)
         self._vendor_of = vendor_of
         self._measured = measured
         self._limit = limit
@@ -70,6 +69,11 @@ class DeviceTable:
         self._present: dict[str, set[str]] = {}  # MAC -> interfaces
         self._together: dict[frozenset[str], int] = {}  # two MACs that may be one device, both in: since
         self._changes: dict[str, Change] = {}
+
+    def use_lists(self, names: Mapping[str, str | None], ignore: Collection[str]) -> None:
+        """What the settings say of names and of whom to ignore, from now on."""
+        self._names = {normal_mac(mac): name for mac, name in names.items()}
+        self._ignore = {normal_mac(mac) for mac in ignore}
 
     def __len__(self) -> int:
         return len(self._devices)
