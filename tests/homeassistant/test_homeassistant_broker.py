@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import subprocess
+import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -19,6 +20,7 @@ from vad.bus.grid import grid_to_png
 from vad.bus.node import Bus
 from vad.bus.session import BusSettings
 from vad.config.mqtt import MqttSettings
+from vad.homeassistant import broker as broker_module
 from vad.homeassistant import link
 from vad.homeassistant.link import HomeAssistant
 from vad.homeassistant.topics import Topics
@@ -133,6 +135,40 @@ async def test_no_broker_is_no_reason_to_end(bus: Bus, tmp_path: Path) -> None:
         await _until(lambda: running.health.state == "degraded")
         assert "refused" in running.health.detail
         assert "mqtt.host" in running.health.detail
+
+
+@pytest.fixture
+async def mute() -> AsyncIterator[int]:
+    """A port where somebody takes connections and says nothing."""
+    writers: list[asyncio.StreamWriter] = []
+    server = await asyncio.start_server(lambda _, writer: writers.append(writer), "127.0.0.1", 0)
+    async with server:
+        yield server.sockets[0].getsockname()[1]
+        for writer in writers:
+            writer.transport.abort()
+
+
+async def test_something_else_at_the_brokers_port(
+    bus: Bus, tmp_path: Path, mute: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(broker_module, "ANSWER_TIMEOUT_S", 0.2)
+    async with home_assistant(bus, tmp_path, mute) as running:
+        await _until(lambda: "no MQTT broker" in running.health.detail)
+
+
+async def test_the_daemon_ends_soon_while_a_broker_does_not_answer(
+    bus: Bus, tmp_path: Path, mute: int
+) -> None:
+    async with home_assistant(bus, tmp_path, mute) as running:
+        await _until(_connecting)
+        assert running.health.state == "starting"
+        begun_s = time.monotonic()
+    assert time.monotonic() - begun_s < 2.0
+
+
+def _connecting() -> bool:
+    """Whether the client's own connection, after the one that only tries the way, is on."""
+    return any(task.get_coro().__qualname__ == "Client.__aenter__" for task in asyncio.all_tasks())
 
 
 async def test_birth_of_home_assistant_brings_discovery_again(bus: Bus, tmp_path: Path) -> None:

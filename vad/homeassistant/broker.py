@@ -29,6 +29,7 @@ ANSWER_TIMEOUT_S = 5.0
 KEEPALIVE_S = 15
 """After one and a half times this without a sign of us the broker sends the last will."""
 FAREWELL_S = 1.0
+CLOSE_S = 0.2
 OFFLINE = b"offline"
 INSTALL = "pip install 'vad[homeassistant]'"
 
@@ -87,12 +88,14 @@ async def connected(
     try:
         await asyncio.shield(opening)
     except asyncio.CancelledError:
-        # the thread goes on; wait for it, or its socket is nobody's
-        with contextlib.suppress(mqtt.MqttError):
-            await opening
-            await client.__aexit__(None, None, None)
+        # the thread goes on for a moment: without it the socket would be nobody's
+        await asyncio.wait({opening}, timeout=FAREWELL_S)
+        await _abandon(client, mqtt)  # before it is cancelled: aiomqtt's callbacks cannot bear that
+        opening.cancel()
+        await asyncio.wait({opening})
         raise
     except mqtt.MqttError as error:
+        await _abandon(client, mqtt)
         raise _refused(error, settings, where) from error
     try:
         yield client
@@ -107,6 +110,13 @@ async def connected(
 
 
 _REMEDY = "Does the broker run, and are mqtt.host and mqtt.port right?"
+
+
+async def _abandon(client: aiomqtt.Client, mqtt: ModuleType) -> None:
+    """Close what a connection that did not come about has left open."""
+    with contextlib.suppress(mqtt.MqttError, TimeoutError):
+        async with asyncio.timeout(CLOSE_S):  # the socket closes at once; who listens is not told
+            await client.__aexit__(None, None, None)
 
 
 def check_settings(settings: MqttSettings, base: Path) -> None:
