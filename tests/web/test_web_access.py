@@ -39,6 +39,13 @@ def test_a_written_token_is_its_owners_alone_and_replaces_the_old_one(tmp_path: 
     assert [p.name for p in tmp_path.iterdir()] == ["web.token"], "no draft is left"
 
 
+def test_the_group_of_a_folder_that_hands_it_on_reads_the_token(tmp_path: Path) -> None:
+    tmp_path.chmod(0o2755)
+    write_token(tmp_path / "web.token")
+    assert (tmp_path / "web.token").stat().st_mode & 0o777 == 0o640
+    TokenFile(tmp_path / "web.token").read()
+
+
 @pytest.mark.parametrize("mode", [0o644, 0o604, 0o602, 0o660, 0o666])
 def test_a_token_that_others_can_read_or_change_is_refused(tmp_path: Path, mode: int) -> None:
     path = tmp_path / "web.token"

@@ -25,6 +25,7 @@ from vad.commands.sessions import sessions_app
 from vad.commands.setup import setup
 from vad.commands.sim import sim
 from vad.commands.status import status
+from vad.commands.web import web_app
 
 app = typer.Typer(
     name="vad",
@@ -61,6 +62,7 @@ device_app.command()(history)
 device_app.command()(heatmap)
 app.add_typer(map_app, name="map")
 app.command()(status)
+app.add_typer(web_app, name="web")
 app.command()(replay)
 app.add_typer(sessions_app, name="sessions")
 app.command()(demo)

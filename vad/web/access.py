@@ -32,12 +32,17 @@ def new_token() -> str:
 
 
 def write_token(path: Path) -> str:
-    """Write a fresh token that only its owner can read, in place of what was there; the token."""
+    """Write a fresh token in place of what was there; the token.
+
+    Only its owner can read it, and its group where the folder hands its own on: that is the daemon's then.
+    """
     token = new_token()
     draft = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
         with os.fdopen(descriptor, "w", encoding="ascii") as file:
+            if path.absolute().parent.stat().st_mode & stat.S_ISGID:
+                os.fchmod(file.fileno(), 0o640)
             file.write(f"{token}\n")
         draft.replace(path)
     except OSError as error:
