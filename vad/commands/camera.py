@@ -305,7 +305,10 @@ def _save_picture(path: Path, session: Session, drive: Deviations | None) -> Non
     if found.camera_from_map is None:
         return
     walls = session.plan.map_from_cell(np.argwhere(session.plan.cells >= 65))
-    lines = [] if found.deviation_m is None else [f"deviation {100 * found.deviation_m:.1f} cm"]
+    off_m = found.deviation_m
+    if drive is not None and len(drive.robot_m):
+        off_m = float(np.mean(np.linalg.norm(drive.camera_m - drive.robot_m, axis=1)))
+    lines = [] if off_m is None else [f"robot and camera differ by {100 * off_m:.1f} cm on average"]
     drawn = draw_overlay(
         image,
         found,

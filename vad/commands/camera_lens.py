@@ -95,6 +95,8 @@ def intrinsics(
             settings = load_settings(config)
             watching = _live(settings.camera, config.resolve().parent, measurement, seconds, as_json)
             asyncio.run(until_ended(watching))
+        if not as_json and not out.is_terminal:
+            out.print()  # there the live table's last line is left open
         try:
             measured = measurement.solve()
         except ValueError as error:

@@ -78,8 +78,8 @@ class CameraMapper:
 
     Args:
         width_px, height_px: of the picture.
-        intrinsics: of a calibrated lens; without it the focal length and one radial term are estimated with
-            the principal point in the centre.
+        intrinsics: of a calibrated lens; without it the focal length, two radial terms and the principal
+            point (near the centre) are estimated.
     """
 
     def __init__(self, width_px: int, height_px: int, intrinsics: Intrinsics | None = None) -> None:

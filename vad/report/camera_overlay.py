@@ -33,6 +33,8 @@ _DIRECTIONS = 1440
 _OWN_WALL_M = 0.5
 _WALL_DEPTH_M = 0.12
 _LETTERS_AT_PX = 640
+# The lower share of the picture that belongs to the legend.
+_FOOT = 0.1
 
 
 def draw_overlay(
@@ -151,7 +153,7 @@ def _draw_grid(image: Image, calibration: CameraCalibration, shown: _Shown) -> N
     near = np.linalg.norm(crossings - position[:2], axis=1) < 0.7 * _REACH_M
     crossings = crossings[near & shown.of(crossings)]
     for (x, y), px in zip(crossings.tolist(), _pixels(crossings, calibration), strict=True):
-        if _inside(px, image):
+        if _inside(px, image) and px[1] < (1.0 - _FOOT) * image.shape[0]:
             _text(image, f"({x:g}, {y:g})", (int(px[0]) + 3, int(px[1]) - 3), 0.36)
 
 
