@@ -133,8 +133,9 @@ class Watcher:
                 f"not in {timeout_s:.0f} s: {what}; topics: {sorted(self.payloads)}"
             ) from None
 
-    async def until_says(self, topic: str, payload: bytes) -> None:
-        await self.until(lambda: self.payloads.get(topic) == payload, f"{topic} {payload[:60]!r}")
+    async def until_says(self, topic: str, payload: bytes, timeout_s: float = 15.0) -> None:
+        said = f"{topic} {payload[:60]!r}"
+        await self.until(lambda: self.payloads.get(topic) == payload, said, timeout_s)
 
     def json(self, topic: str) -> dict[str, Any]:
         value = msgspec.json.decode(self.payloads[topic])
