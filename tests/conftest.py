@@ -14,6 +14,8 @@ from hypothesis import settings
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as vad.cli does, before NumPy is imported
 
+os.environ["COLUMNS"] = "160"  # tables look alike in a terminal, in a pipe and in a parallel run
+
 # How long an example takes says how busy the machine is, not whether the code is right.
 # In CI every run tries the same examples; elsewhere each run looks for new ones.
 settings.register_profile("vad", deadline=None, derandomize="CI" in os.environ)
