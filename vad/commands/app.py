@@ -15,7 +15,7 @@ from vad.commands.device import device_app
 from vad.commands.device_past import heatmap, history
 from vad.commands.devices import devices
 from vad.commands.doctor import doctor
-from vad.commands.install import install
+from vad.commands.install import install, uninstall
 from vad.commands.map import map_app
 from vad.commands.pki import app as pki_app
 from vad.commands.replay import replay
@@ -69,6 +69,7 @@ app.command()(demo)
 app.command()(sim)
 app.command()(doctor)
 app.command()(install)
+app.command()(uninstall)
 app.add_typer(camera_app, name="camera")
 app.add_typer(csi_app, name="csi")
 app.add_typer(robot_app, name="robot")

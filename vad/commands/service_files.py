@@ -11,6 +11,7 @@ PROGRAM = "/usr/bin/vad"
 """What the units as shipped start."""
 MARK = "# Written by `vad install`; `vad uninstall` takes it away.\n"
 """First line of what is written outside a package; a file without it is somebody's own and stays."""
+HUB_UNIT, AGENT_UNIT = "vad.service", "vad-agent.service"
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,15 +31,14 @@ class ServiceFile:
         return MARK + self.text().replace(f"{PROGRAM} ", f"{program} ")
 
 
-HUB_UNIT, AGENT_UNIT = "vad.service", "vad-agent.service"
+def _unit(name: str) -> ServiceFile:
+    return ServiceFile(name, f"usr/lib/systemd/system/{name}", f"etc/systemd/system/{name}")
 
-FILES = (
-    ServiceFile("vad.sysusers", "usr/lib/sysusers.d/vad.conf", "etc/sysusers.d/vad.conf"),
-    ServiceFile("vad.tmpfiles", "usr/lib/tmpfiles.d/vad.conf", "etc/tmpfiles.d/vad.conf"),
-    ServiceFile("70-vad.rules", "usr/lib/udev/rules.d/70-vad.rules", "etc/udev/rules.d/70-vad.rules"),
-    ServiceFile(HUB_UNIT, f"usr/lib/systemd/system/{HUB_UNIT}", f"etc/systemd/system/{HUB_UNIT}"),
-    ServiceFile(AGENT_UNIT, f"usr/lib/systemd/system/{AGENT_UNIT}", f"etc/systemd/system/{AGENT_UNIT}"),
-)
+
+USERS = ServiceFile("vad.sysusers", "usr/lib/sysusers.d/vad.conf", "etc/sysusers.d/vad.conf")
+FOLDERS = ServiceFile("vad.tmpfiles", "usr/lib/tmpfiles.d/vad.conf", "etc/tmpfiles.d/vad.conf")
+RULES = ServiceFile("70-vad.rules", "usr/lib/udev/rules.d/70-vad.rules", "etc/udev/rules.d/70-vad.rules")
+FILES = (USERS, FOLDERS, RULES, _unit(HUB_UNIT), _unit(AGENT_UNIT))
 
 
 def shipped_folder() -> Path:
@@ -46,6 +46,13 @@ def shipped_folder() -> Path:
     package = Path(vad.__file__).parent
     inside = package / "systemd"
     return inside if inside.is_dir() else package.parent / "systemd"
+
+
+def is_packaged(root: Path = Path("/")) -> bool:
+    """Whether a package of the distribution has brought the units."""
+    return any(
+        (root / folder / HUB_UNIT).exists() for folder in ("usr/lib/systemd/system", "lib/systemd/system")
+    )
 
 
 def write_packaged(root: Path) -> list[Path]:

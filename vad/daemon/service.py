@@ -20,6 +20,7 @@ from typing import Any
 from vad.config import Settings, load_settings
 from vad.daemon.captures import Captures
 from vad.daemon.checks import check_files
+from vad.daemon.confinement import is_stale
 from vad.daemon.live import Live
 from vad.daemon.notify import notify
 from vad.daemon.registry import Registry
@@ -32,6 +33,7 @@ from vad.streams import DropOldestQueue
 
 _log = logging.getLogger(__name__)
 
+DROP_IN_FOLDER = Path("/etc/systemd/system/vad.service.d")
 WRITE_S = 60.0
 """What a slow disk may take beside the solving of a walk."""
 
@@ -123,6 +125,8 @@ class _Service:
         """Run with these settings, and then with those that a reload brings."""
         before: Settings | None = None
         while True:
+            if is_stale(settings, DROP_IN_FOLDER):
+                _log.warning("systemd lets the daemon reach what earlier settings named: sudo vad install")
             try:
                 fresh = await self._until_others(settings)
             except VadError as error:
