@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from rich.console import Console
@@ -16,6 +22,7 @@ from vad.mapping.camera_calibration import CameraCalibration, Deviations
 from vad.mapping.camera_stage import CameraMapper
 from vad.report.camera_overlay import draw_overlay
 from vad.sim.camera_drive import POSE_SIGMA_M, Drive, make_drive
+from vad.sim.scenario import make_home
 
 S_NS = 1_000_000_000
 
@@ -142,3 +149,50 @@ def test_wrong_use_is_told_in_one_line(tmp_path: Path) -> None:
         assert done.exit_code == 2
         assert "none.yaml" in done.output
         assert "Traceback" not in done.output
+
+
+@contextmanager
+def home(folder: Path, seed: int) -> Iterator[Path]:
+    """A simulated home from its beginning, the robot about to drive; gives the settings."""
+    settings = folder / "vad.yaml"
+    settings.unlink(missing_ok=True)
+    command = [sys.executable, "-m", "vad", "sim", "--dir", str(folder), "--seed", str(seed), "--fifo"]
+    with (folder.with_suffix(".log")).open("wb") as log:
+        playing = subprocess.Popen(command, stdout=log, stderr=log)
+    try:
+        until_s = time.monotonic() + 30.0
+        while not settings.exists():
+            assert time.monotonic() < until_s, "the home does not begin"
+            time.sleep(0.05)
+        yield settings
+    finally:
+        playing.terminate()
+        playing.wait()
+
+
+def camera(command: str, settings: Path, picture: Path, *more: str) -> tuple[int, dict[str, object]]:
+    """Exit code and JSON of `vad camera COMMAND`; it ends by itself."""
+    line = [sys.executable, "-m", "vad", "camera", command, "--config", str(settings), "--json"]
+    done = subprocess.run(
+        [*line, "--picture", str(picture), *more], capture_output=True, check=False, timeout=150
+    )
+    assert b"Traceback" not in done.stderr, done.stderr.decode()
+    return done.returncode, json.loads(done.stdout)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_calibrate_ends_when_the_robot_has_come_home_and_check_agrees(tmp_path: Path) -> None:
+    folder = tmp_path / "home"
+    with home(folder, 3) as settings:
+        code, said = camera("calibrate", settings, tmp_path / "calibrated.png")
+    assert code == 0
+    assert said["status"] == "valid"
+    eye_m = np.array(said["position_m"])
+    assert float(np.linalg.norm(eye_m - make_home(3).camera.eye_m)) < 0.15
+    with home(folder, 3) as settings:
+        code, said = camera("check", settings, tmp_path / "checked.png", "--for", "40")
+    assert code == 0
+    assert said["right"] is True
+    for name in ("calibrated.png", "checked.png"):
+        assert cv2.imread(str(tmp_path / name)).shape == (480, 640, 3)
