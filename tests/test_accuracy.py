@@ -41,7 +41,7 @@ def error_m(score: Score) -> float:
 @pytest.mark.parametrize(("setup", "single_m", "together_m"), [("office", 1.9, 0.6), ("open", 1.0, 0.3)])
 def test_paper_setups(setup: Setup, single_m: float, together_m: float) -> None:
     """An L, a rectangle and a circle with 3 cm of white and 6 cm of slow track error."""
-    single, fused = judged(partial(paper_cases, setup, 0, 3), "slow 6 cm")
+    single, fused = judged(partial(paper_cases, setup, 0, 3, (0.06,)), "slow 6 cm")
     assert worst_m(single) < single_m
     assert error_m(fused) < together_m
     assert fused.in90
@@ -66,7 +66,7 @@ def test_recordings() -> None:
 
 def damaged() -> Iterator[tuple[str, Case]]:
     """One walk of the open-space set-up, each time with something missing."""
-    case = next(paper_cases("open", 0, 2))[0]
+    case = next(paper_cases("open", 0, 2, (0.02,)))[0]
     recording, rng = case.recording, np.random.default_rng(3)
     t_ns, csi, walk = recording.t_ns, recording.csi, recording.walk
     middle_ns = int(t_ns[len(t_ns) // 2])

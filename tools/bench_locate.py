@@ -48,6 +48,7 @@ COLUMNS: tuple[tuple[str, str, str], ...] = (
     ("CPU s", "cpu_s", ".1f"),
 )
 ROOM_COLUMNS = (("right room", "right_room", ".0%"), ("wrong, sure", "wrong_room_confident", ".0%"))
+HEIGHT_COLUMNS = (("height told", "height_told", ".0%"), ("in it", "height_in", ".0%"))
 LEGEND = (
     "in 50, in 90: share of truths in those regions; r90: median radius of the 90 % region; out: mean "
     "error away from the walk; unsure, no: uncertain, refused; CRB: rms bound of Doppler alone, perfect path "
@@ -105,7 +106,7 @@ def table_of(name: str, ablation: str, scores: list[Score]) -> Table:
     table = Table(
         title=f"{name}{'' if ablation == 'full' else f', {ablation}'}", title_justify="left", box=None
     )
-    columns = COLUMNS + (ROOM_COLUMNS if name == "homes" else ())
+    columns = COLUMNS + (ROOM_COLUMNS + HEIGHT_COLUMNS if name == "homes" else ())
     table.add_column("", no_wrap=True)
     for title, _, _ in columns:
         table.add_column(title, justify="right", no_wrap=True)

@@ -23,7 +23,7 @@ from vad.solve import bounds_of, walk_of
 
 RECORDINGS = Path(__file__).resolve().parents[2] / "shared" / "data" / "csi" / "witraj"
 WHITE_M = 0.03
-SLOW_M = (0.02, 0.06)
+SLOW_M = (0.0, 0.02, 0.06)
 HOME_SLOW_M = 0.03
 WIDER_M = 2.0
 LATE_S = 0.3
@@ -74,8 +74,10 @@ def recorded(group: tuple[str, str], limit: int | None = None) -> Iterator[list[
         yield cases
 
 
-def paper_cases(setup: Setup, seed: int, limit: int | None = None) -> Iterator[list[Case]]:
-    """Each walk of a set-up, seen by two cameras: with a slow error of 2 cm and of 6 cm."""
+def paper_cases(
+    setup: Setup, seed: int, limit: int | None = None, slow_errors_m: tuple[float, ...] = SLOW_M
+) -> Iterator[list[Case]]:
+    """Each walk of a set-up, seen by a camera for each of the slow errors."""
     scenario, walks = paper_setup(setup, seed)
     radio = paper_radio(setup, scenario)
     for kind in walks[:limit]:
@@ -83,7 +85,7 @@ def paper_cases(setup: Setup, seed: int, limit: int | None = None) -> Iterator[l
         t_ns, csi = heard(radio, walk)
         who = f"{WALKERS[kind.walker].height_m:.2f} m tall"
         cases = []
-        for slow_m in SLOW_M:
+        for slow_m in slow_errors_m:
             noise = TrackNoise(WHITE_M, slow_m)
             seen = seen_walk(walk, noise, np.random.default_rng([seed, kind.number, round(slow_m * 100)]))
             tags = (f"slow {slow_m * 100:.0f} cm", f"slow {slow_m * 100:.0f} cm, {kind.shape}")
@@ -104,6 +106,7 @@ def paper_cases(setup: Setup, seed: int, limit: int | None = None) -> Iterator[l
                     np.array(scenario.device_m[:2]),
                     scenario.room_m,
                     bound_of(scenario, walk, noise),
+                    height_m=scenario.device_m[2],
                 )
             )
         yield cases
@@ -139,6 +142,7 @@ def home_cases(seed: int) -> Iterator[list[Case]]:
                 bound_of(scenario, walk, noise),
                 scenario.room_m[2],
                 plan,
+                scenario.device_m[2],
             )
         ]
 

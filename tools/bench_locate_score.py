@@ -52,7 +52,8 @@ ABLATIONS: dict[str, dict[str, float]] = {
 class Case:
     """One walk to be solved and what is known of it.
 
-    tags: what it is pooled by; wall_x_m, plan: where the next room begins and the floor plan, in homes.
+    tags: what it is pooled by; wall_x_m, plan: where the next room begins and the floor plan, in homes;
+    height_m: the device's, where it is known.
     """
 
     name: str
@@ -64,12 +65,14 @@ class Case:
     bound: DopplerBound | None = None
     wall_x_m: float | None = None
     plan: FloorPlan | None = None
+    height_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Score:
     """Of one place. error_m None where refused; outward_m: estimate - truth away from the walk's middle;
-    right_room None where there are no rooms."""
+    right_room None where there are no rooms; height_told: whether a range was given, height_in: whether it
+    holds the truth, None where none was given."""
 
     name: str
     tags: tuple[str, ...]
@@ -85,6 +88,8 @@ class Score:
     paper_open_m: float | None = None
     right_room: bool | None = None
     wrong_room_confident: bool | None = None
+    height_told: bool | None = None
+    height_in: bool | None = None
     cpu_s: float = 0.0
 
 
@@ -105,7 +110,8 @@ def solve(case: Case, ablation: str = "full") -> tuple[Score, Evidence]:
     cpu_s = time.process_time() - before
     if evidence.posterior is None:
         return Score(case.name, case.tags, 1, evidence.status, cpu_s=cpu_s), evidence
-    score = _score(case.name, [case], evidence.posterior, evidence.status)
+    told_m = None if evidence.terms is None else evidence.terms.height_range_m()
+    score = _score(case.name, [case], evidence.posterior, evidence.status, told_m)
     if ablation == "full" and evidence.path is not None:
         coarse = Grid.over(case.bounds_m, PAPER_GRID_STEP_M)
         office_m, open_m = (
@@ -126,11 +132,18 @@ def fuse(name: str, cases: Sequence[Case], evidence: Sequence[Evidence]) -> Scor
     terms = [e.terms for e in evidence if e.terms is not None]
     if not terms:
         return None
-    posterior = reduce(Terms.plus, terms).posterior(Grid.over(cases[0].bounds_m, GRID_STEP_M))
-    return _score(name, cases, posterior, place_from_posterior(posterior).status)
+    total = reduce(Terms.plus, terms)
+    posterior = total.posterior(Grid.over(cases[0].bounds_m, GRID_STEP_M))
+    return _score(name, cases, posterior, place_from_posterior(posterior).status, total.height_range_m())
 
 
-def _score(name: str, cases: Sequence[Case], posterior: Posterior, status: str) -> Score:
+def _score(
+    name: str,
+    cases: Sequence[Case],
+    posterior: Posterior,
+    status: str,
+    height90_m: tuple[float, float] | None,
+) -> Score:
     first = cases[0]
     if first.plan is not None:
         posterior = on_plan(posterior, plan_prior(first.plan, posterior.grid))
@@ -159,6 +172,10 @@ def _score(name: str, cases: Sequence[Case], posterior: Posterior, status: str) 
         reduce(DopplerBound.plus, bounds).rms_m if bounds else None,
         right_room=right_room,
         wrong_room_confident=confident,
+        height_told=None if first.height_m is None else height90_m is not None,
+        height_in=None
+        if first.height_m is None or height90_m is None
+        else height90_m[0] <= first.height_m <= height90_m[1],
     )
 
 
@@ -207,6 +224,8 @@ def summary(scores: Sequence[Score]) -> dict[str, float | int | None]:
             "paper_open_mean_m": mean("paper_open_m"),
             "right_room": mean("right_room", [s for s in placed if s.status == "located"]),
             "wrong_room_confident": mean("wrong_room_confident"),
+            "height_told": mean("height_told"),
+            "height_in": mean("height_in"),
             "cpu_s": mean("cpu_s", [s for s in scores if s.walks == 1]),
         }
     return result
