@@ -256,6 +256,40 @@ async def test_a_storm_of_changes_becomes_few_updates_and_the_last_counts(
     assert TOPICS.device_config(LAMP) not in came
 
 
+async def test_a_hundred_devices_are_told_within_seconds_and_the_loop_goes_on(
+    bus: Bus, tmp_path: Path
+) -> None:
+    macs = [f"02:00:00:00:00:{i:02x}" for i in range(100)]
+    with Mosquitto(tmp_path) as broker:
+        async with Watcher(broker.port) as watcher, home_assistant(bus, tmp_path, broker.port):
+            await watcher.until_says(TOPICS.availability, b"online")
+            stalls = asyncio.create_task(_longest_stall_s())
+            begun_s, used_s = time.monotonic(), time.process_time()
+            for mac in macs:
+                bus.publish_device(device(mac))
+            wanted = {topic for mac in macs for topic in (TOPICS.device(mac), TOPICS.device_config(mac))}
+            await watcher.until(lambda: wanted <= set(watcher.payloads), "a hundred devices")
+            took_s, used_s = time.monotonic() - begun_s, time.process_time() - used_s
+            stalls.cancel()
+            stall_s = await stalls
+    print(  # noqa: T201 - the measured figure
+        f"100 devices: {took_s:.2f} s, {used_s:.2f} s of a core, the loop stood still {stall_s * 1e3:.0f} ms"
+    )
+    assert used_s < 2.0
+
+
+async def _longest_stall_s() -> float:
+    """How long the event loop did nothing else, at most, until cancelled."""
+    longest_s = 0.0
+    try:
+        while True:
+            slept_s = time.monotonic()
+            await asyncio.sleep(0.001)
+            longest_s = max(longest_s, time.monotonic() - slept_s - 0.001)
+    except asyncio.CancelledError:
+        return longest_s
+
+
 @pytest.mark.slow
 async def test_the_map_is_a_picture_that_follows(bus: Bus, tmp_path: Path) -> None:
     cells = np.zeros((40, 60), np.int8)

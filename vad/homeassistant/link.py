@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import logging
 import time
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,7 +35,9 @@ STEADY_S = 10.0
 DEVICE_EVERY_NS = 1_000_000_000
 STATUS_EVERY_NS = 5_000_000_000
 """A topic changes at most so often; what is sent is the newest."""
-PICTURE_EVERY_S = 15.0
+PICTURE_EVERY_S = 30.0
+ON_THEIR_WAY = 8
+"""Messages that the broker has not acknowledged yet, at most."""
 
 _log = logging.getLogger(__name__)
 
@@ -179,9 +182,9 @@ class HomeAssistant:
         """Send what is due, then `online`; wait for more."""
         while True:
             self._news.clear()
-            for topic, payload in self._retained.due(time.monotonic_ns()):
-                await self._publish(client, topic, payload)
-                self._retained.sent(topic, payload, time.monotonic_ns())
+            due = self._retained.due(time.monotonic_ns())
+            while some := list(islice(due, ON_THEIR_WAY)):
+                await self._publish(client, some)
             self._retained.want(self._topics.availability, b"online")
             next_ns = self._retained.next_ns()
             wait_s = None if next_ns is None else max(0.0, (next_ns - time.monotonic_ns()) / 1e9)
@@ -189,9 +192,16 @@ class HomeAssistant:
                 async with asyncio.timeout(wait_s):
                     await self._news.wait()
 
-    async def _publish(self, client: aiomqtt.Client, topic: str, payload: bytes) -> None:
-        await client.publish(topic, payload, qos=1, retain=True)
-        self.health.counters["forgotten" if payload == GONE else "published"] += 1
+    async def _publish(self, client: aiomqtt.Client, some: list[tuple[str, bytes]]) -> None:
+        """Send these in order, and wait until the broker has them all."""
+        sending = (client.publish(topic, payload, qos=1, retain=True) for topic, payload in some)
+        for (topic, payload), failed in zip(
+            some, await asyncio.gather(*sending, return_exceptions=True), strict=True
+        ):
+            if failed is not None:
+                raise failed
+            self._retained.sent(topic, payload, time.monotonic_ns())
+            self.health.counters["forgotten" if payload == GONE else "published"] += 1
 
     async def _keep_picture(self) -> None:
         """Draw the map anew when something on it changed, until cancelled; only while a broker is there."""

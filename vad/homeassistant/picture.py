@@ -46,7 +46,7 @@ def scene_of(
             source=device.source,
             mac=device.mac,
             name=device.name,
-            state=device.state,
+            state="waiting" if device.state == "capturing" else device.state,
             reason="" if device.x_m is not None else device.reason,
             x_m=device.x_m,
             y_m=device.y_m,
