@@ -168,7 +168,12 @@ class MultipartParser:
         return True
 
     def _read_headers(self) -> bool:
-        ends = [(at, len(gap)) for gap in (b"\r\n\r\n", b"\n\n") if (at := self._buffer.find(gap)) >= 0]
+        # Not beyond where a head may end: behind it lies the picture.
+        ends = [
+            (at, len(gap))
+            for gap in (b"\r\n\r\n", b"\n\n")
+            if (at := self._buffer.find(gap, 0, MAX_HEAD_BYTES + len(gap))) >= 0
+        ]
         if not ends:
             if len(self._buffer) > MAX_HEAD_BYTES:
                 self._abandon()
@@ -176,9 +181,8 @@ class MultipartParser:
             return False
         at, gap_length = min(ends)
         block = bytes(self._buffer[:at])
-        if block.startswith(b"--") or at > MAX_HEAD_BYTES:
-            # The closing delimiter, or rubbish: look for the next one.
-            self.bad += at > MAX_HEAD_BYTES
+        if block.startswith(b"--"):
+            # The closing delimiter: look for the next one.
             self._in_part = False
             return True
         self._drop(at + gap_length)

@@ -20,11 +20,11 @@ from vad.streams import DropOldestQueue
 log = logging.getLogger(__name__)
 
 RETRY_S = 5.0
-# Waking once per message costs ten times the work of the messages; the clock map takes the wait out again.
-COALESCE_S = 0.020
-# A batch costs as much as some hundred of its packets: a busy source is left alone for longer.
-BUSY_MESSAGES = 100
-BUSY_COALESCE_S = 0.080
+# A batch costs as much as some hundred of its packets; the clock map takes the wait out again.
+COALESCE_S = 0.080
+# An idle network's few packets are nobody's walk: they may gather for longer.
+QUIET_MESSAGES = 20
+QUIET_COALESCE_S = 0.150
 RECEIVE_BUFFER_BYTES = 4 << 20
 # One drain decodes at most this many messages before the event loop gets its turn.
 DRAIN_MESSAGES = 2048
@@ -118,8 +118,8 @@ class Connector:
             while self._drain(sock, out, woken_ns):
                 woken_ns = None
                 await asyncio.sleep(0)
-            busy = self.health.counters["messages"] - before >= BUSY_MESSAGES
-            coalesce_s = BUSY_COALESCE_S if busy else COALESCE_S
+            quiet = self.health.counters["messages"] - before < QUIET_MESSAGES
+            coalesce_s = QUIET_COALESCE_S if quiet else COALESCE_S
 
     def _drain(self, sock: socket.socket, out: DropOldestQueue[CsiBatch], woken_ns: int | None) -> bool:
         """Take what waits, at most DRAIN_MESSAGES; True when there may be more."""

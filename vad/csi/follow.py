@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import errno
+import fcntl
 import logging
 import os
 import stat
@@ -21,6 +23,11 @@ log = logging.getLogger(__name__)
 RETRY_S = 1.0
 POLL_S = 0.05
 COALESCE_S = 0.015
+# A batch costs as much as some hundred of its packets: few bytes may gather for longer, and a FIFO is made
+# large enough for many that come all at once.
+QUIET_BYTES = 2048
+QUIET_COALESCE_S = 0.150
+_FIFO_BYTES = 1 << 20
 # At most 1200 packets: decoding them holds the event loop for a few milliseconds.
 _READ_BYTES = 1 << 18
 
@@ -88,7 +95,9 @@ class FollowLog:
             self._intake.restart()
 
     async def _read_fifo(self, fifo_fd: int, out: DropOldestQueue[CsiBatch]) -> None:
-        loop = asyncio.get_running_loop()
+        with contextlib.suppress(OSError):  # past the user's quota the kernel's own size must do
+            fcntl.fcntl(fifo_fd, fcntl.F_SETPIPE_SZ, _FIFO_BYTES)
+        loop, coalesce_s = asyncio.get_running_loop(), COALESCE_S
         while True:
             woken: asyncio.Future[int] = loop.create_future()
             loop.add_reader(fifo_fd, _wake, woken)
@@ -96,7 +105,8 @@ class FollowLog:
                 woken_ns: int | None = await woken
             finally:
                 loop.remove_reader(fifo_fd)
-            await asyncio.sleep(COALESCE_S)
+            await asyncio.sleep(coalesce_s)
+            before = self.health.counters["bytes"]
             while True:
                 try:
                     data = os.read(fifo_fd, _READ_BYTES)
@@ -107,6 +117,8 @@ class FollowLog:
                 self._emit(data, out, woken_ns)
                 woken_ns = None
                 await asyncio.sleep(0)
+            quiet = self.health.counters["bytes"] - before < QUIET_BYTES
+            coalesce_s = QUIET_COALESCE_S if quiet else COALESCE_S
 
     async def _read_file(self, file_fd: int, out: DropOldestQueue[CsiBatch]) -> None:
         position = 0

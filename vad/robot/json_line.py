@@ -42,6 +42,10 @@ class JsonLineDialogue:
         """Nothing: the robot talks by itself."""
         return b""
 
+    def due_ns(self) -> int | None:
+        """Never: the robot talks by itself."""
+        return None
+
     def receive(self, data: bytes, now_ns: int) -> list[RobotPose | NoPlace]:
         """What the lines that end in `data`, arrived at `now_ns`, say."""
         reports: list[RobotPose | NoPlace] = []

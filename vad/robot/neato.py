@@ -207,6 +207,12 @@ class NeatoPoller:
         self._scanning = self._scan_is_due(now_ns)
         return SCAN_COMMAND if self._scanning else POSE_COMMAND
 
+    def due_ns(self) -> int | None:
+        """When the next command is due, or the reply to the last one overdue."""
+        if self._asked_ns is not None:
+            return self._asked_ns + (SCAN_TIMEOUT_NS if self._scanning else REPLY_TIMEOUT_NS)
+        return self._next_ns
+
     def _scan_is_due(self, now_ns: int) -> bool:
         if self._scan_every_ns is None:
             return False

@@ -64,6 +64,10 @@ class StreamDialogue:
         self._asked_ns = now_ns
         return START + STREAM_COMMAND
 
+    def due_ns(self) -> int | None:
+        """When it is asked again."""
+        return None if self._asked_ns is None else self._asked_ns + ASK_AGAIN_NS
+
     def receive(self, data: bytes, now_ns: int) -> list[RoombaReading]:
         """The readings of the frames that end in `data`, arrived at `now_ns`; earlier ones by 15 ms each."""
         self._buffer += data

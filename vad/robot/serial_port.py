@@ -8,6 +8,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import select
+import socket
 import termios
 import threading
 import time
@@ -19,7 +21,9 @@ import serial
 from vad.health import Health
 
 READ_SLICE_S = 0.02
-"""How long one read waits: the resolution of the dialogue's timing and of stopping."""
+"""How long one read waits where a port cannot be waited for together with the end (rfc2217://)."""
+LONGEST_WAIT_S = 0.5
+"""For something to arrive or to be due: the resolution of what is said about silence."""
 WRITE_TIMEOUT_S = 0.5
 SILENCE_S = 2.0
 """After this long without anything understood the line is degraded."""
@@ -45,7 +49,11 @@ class SerialDialogue(Protocol[T_co]):
     bad: int
 
     def to_send(self, now_ns: int) -> bytes:
-        """What to write now; empty when nothing is due. Called every READ_SLICE_S or sooner."""
+        """What to write now; empty when nothing is due."""
+        ...
+
+    def due_ns(self) -> int | None:
+        """When `to_send` wants to be asked again; None where only something that arrives can change that."""
         ...
 
     def receive(self, data: bytes, now_ns: int) -> Sequence[T_co]:
@@ -84,7 +92,8 @@ class SerialLine(Generic[T]):
         loop = asyncio.get_running_loop()
         stop = threading.Event()
         ended = asyncio.Event()
-        worker = _Worker(self, loop, stop, deliver, ended)
+        ours, theirs = socket.socketpair()
+        worker = _Worker(self, loop, stop, theirs, deliver, ended)
         thread = threading.Thread(target=worker.run, name=f"serial {self.port}", daemon=True)
         thread.start()
         try:
@@ -92,6 +101,7 @@ class SerialLine(Generic[T]):
             raise RuntimeError(f"the thread of {self.port} died of an error in it, which it has printed")
         finally:
             stop.set()
+            ours.close()  # what waits for the line wakes
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(JOIN_S):
                     await ended.wait()
@@ -141,12 +151,14 @@ class _Worker(Generic[T]):
         line: SerialLine[T],
         loop: asyncio.AbstractEventLoop,
         stop: threading.Event,
+        stop_socket: socket.socket,
         deliver: Callable[[T], None],
         ended: asyncio.Event,
     ) -> None:
         self._line = line
         self._loop = loop
         self._stop = stop
+        self._stop_socket = stop_socket
         self._deliver = deliver
         self._ended = ended
 
@@ -154,6 +166,7 @@ class _Worker(Generic[T]):
         try:
             self._keep_talking()
         finally:
+            self._stop_socket.close()
             self._call_soon(self._ended.set)
 
     def _keep_talking(self) -> None:
@@ -178,7 +191,7 @@ class _Worker(Generic[T]):
         while not self._stop.is_set():
             if command := dialogue.to_send(time.monotonic_ns()):
                 port.write(command)
-            data = _read_available(port)
+            data = _read_available(port) if self._arrives(port, dialogue.due_ns()) else b""
             now_ns = time.monotonic_ns()
             values = dialogue.receive(data, now_ns) if data else []
             for value in values:
@@ -197,6 +210,16 @@ class _Worker(Generic[T]):
             if silence_s > REOPEN_S:
                 break
         return understood
+
+    def _arrives(self, port: serial.Serial, due_ns: int | None) -> bool:
+        """Wait until something arrives, is due, or it ends; whether there may be something to read."""
+        if self._line.port.startswith("rfc2217:"):
+            return True  # nothing there to wait for: it is asked again and again
+        wait_s = LONGEST_WAIT_S
+        if due_ns is not None:
+            wait_s = min(max((due_ns - time.monotonic_ns()) / 1e9, 0.0), LONGEST_WAIT_S)
+        ready, _, _ = select.select([port.fileno(), self._stop_socket.fileno()], [], [], wait_s)
+        return port.fileno() in ready
 
     def _post(self, function: Callable[..., None], *values: object) -> None:
         if not self._stop.is_set():
