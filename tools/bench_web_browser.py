@@ -116,8 +116,10 @@ class Browser:
         await page.call("Emulation.setEmulatedMedia", features=[scheme])
         return page
 
-    async def call(self, method: str, session: str | None = None, **parameters: Any) -> Any:
-        """Ask the browser; BrowserError where it refuses."""
+    async def call(
+        self, method: str, session: str | None = None, *, within_s: float = ANSWER_S, **parameters: Any
+    ) -> Any:
+        """Ask the browser; BrowserError where it refuses, TimeoutError where it does not answer."""
         assert self._socket is not None
         self._number += 1
         number = self._number
@@ -127,7 +129,7 @@ class Browser:
             question["sessionId"] = session
         await self._socket.send_json(question)
         try:
-            async with asyncio.timeout(ANSWER_S):
+            async with asyncio.timeout(within_s):
                 return await answer
         finally:
             del self._asked[number]
@@ -218,10 +220,15 @@ class Page:
         if "errorText" in answer:
             raise BrowserError(f"{url}: {answer['errorText']}")
 
-    async def value(self, script: str) -> Any:
+    async def value(self, script: str, *, within_s: float = ANSWER_S) -> Any:
         """What an expression, or a promise, comes to in the page."""
         answer = await self.call(
-            "Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True, userGesture=True
+            "Runtime.evaluate",
+            within_s=within_s,
+            expression=script,
+            awaitPromise=True,
+            returnByValue=True,
+            userGesture=True,
         )
         if "exceptionDetails" in answer:
             details = answer["exceptionDetails"]
@@ -236,8 +243,7 @@ class Page:
             "if (value) found(value); else setTimeout(look, 20); }; look(); })"
         )
         try:
-            async with asyncio.timeout(timeout_s):
-                return await self.value(waiting)
+            return await self.value(waiting, within_s=timeout_s)
         except TimeoutError:
             raise BrowserError(f"not in {timeout_s:.0f} s: {script}; problems: {self.problems}") from None
 
