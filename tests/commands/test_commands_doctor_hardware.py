@@ -19,7 +19,7 @@ from vad.camera.v4l2_formats import Format, V4l2Description
 from vad.commands.doctor import robot, sight
 from vad.commands.doctor.network import check_access_point, check_leases, check_mqtt
 from vad.commands.doctor.radio import check_card, check_connector, check_csi, check_rights
-from vad.commands.doctor.robot import check_robot, check_serial_port
+from vad.commands.doctor.robot import check_robot, check_router, check_serial_port
 from vad.commands.doctor.sight import check_camera, format_finding
 from vad.config import V4l2CameraSettings
 from vad.csi.logfile import record
@@ -73,6 +73,14 @@ async def test_a_robot_that_is_slower_than_asked(tmp_path: Path) -> None:
     async with going(neato.run()):
         (found,) = await check_robot(wanted)
     assert (found.verdict, "rate_hz" in found.remedy) == ("warning", True)
+
+
+async def test_routers_that_answer_or_do_not(tmp_path: Path) -> None:
+    server = await asyncio.start_server(lambda _, writer: writer.close(), "127.0.0.1", 0)
+    async with server:
+        there = f"tcp/127.0.0.1:{server.sockets[0].getsockname()[1]}"
+        found = await check_router(visit(tmp_path, bus={"connect": [there, f"tcp/127.0.0.1:{free_port()}"]}))
+    assert verdicts(found) == [("zenoh router", "ok"), ("zenoh router", "bad")]
 
 
 async def test_a_port_that_the_service_may_not_open(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import socket
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -221,6 +222,29 @@ async def test_a_file_that_only_root_may_read_is_found(tmp_path: Path) -> None:
     found = await check_settings(wanted)
     assert verdicts(found) == [("settings", "bad")]
     assert "vad may not" in found[0].text
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
+async def test_what_another_user_may_not_look_at_is_advice(tmp_path: Path) -> None:
+    """The state folder is the service's alone: who asks without sudo is told so, and sees all the rest."""
+    open_to_all(tmp_path)
+    wanted = visit(tmp_path, bus={"listen": []})
+    wanted.state_dir.mkdir(0o700)
+    program = (
+        "import asyncio, concurrent.futures.thread, os; from pathlib import Path;"
+        "from vad.commands.doctor import examine, Visit;"
+        "from vad.config import parse_settings; text = open('vad.yaml').read();"
+        "os.setgid(65534); os.setuid(65534);"
+        "v = Visit(parse_settings(text, where=''), Path('vad.yaml'), 1.0, root=Path('/none'));"
+        "[print(f) for f in asyncio.run(examine(v, ['disk', 'clock']))]"
+    )
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, "-c", program, cwd=tmp_path, stdout=asyncio.subprocess.PIPE
+    )
+    told, _ = await process.communicate()
+    assert b"state may not be looked at by you" in told
+    assert b"sudo vad doctor" in told
+    assert b"check='clock'" in told
 
 
 def test_drop_ins_of_the_unit_count(tmp_path: Path) -> None:

@@ -117,7 +117,13 @@ async def examine(visit: Visit, wanted: list[str]) -> list[Finding]:
     found: dict[str, list[Finding]] = {}
 
     async def look(name: str) -> None:
-        found[name] = [finding for check in CHECKS[name] for finding in await check(visit)]
+        findings = found[name] = []
+        for check in CHECKS[name]:
+            try:
+                findings += await check(visit)
+            except PermissionError as error:
+                what = f"{error.filename} may not be looked at by you"
+                findings.append(Finding(name, "warning", what, "sudo vad doctor"))
 
     if ALONE in wanted:
         await look(ALONE)

@@ -182,8 +182,11 @@ async def check_certificates(visit: Visit) -> list[Finding]:
     if not any(endpoint.startswith("tls/") for endpoint in visit.settings.bus.listen):
         return []
     now = utc_now()
+    folder = pki_folder(visit.settings, visit.config_file)
+    if folder.exists():
+        next(folder.iterdir(), None)  # PermissionError where that is for the service alone
     try:
-        files = PkiFolder(pki_folder(visit.settings, visit.config_file)).hub_files()
+        files = PkiFolder(folder).hub_files()
     except VadError as error:
         return [Finding.of_error("certificates", error)]
     days = days_left(files.ends_at, now)

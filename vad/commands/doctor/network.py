@@ -83,10 +83,11 @@ async def check_mqtt(visit: Visit) -> list[Finding]:
     findings = []
     if settings.password_file is not None:
         file = base / settings.password_file
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(FileNotFoundError):
             if file.stat().st_mode & (stat.S_IROTH | stat.S_IWOTH):
                 what = f"every user can read {settings.password_file}"
                 findings.append(Finding("mqtt", "warning", what, f"sudo chmod o-rw {file}"))
+            file.open("rb").close()  # PermissionError where it is for the service alone
         findings += visit.refused("mqtt", file, "r")
         if not settings.tls and not _is_here(settings.host):
             what = "the password goes over the network for all to read"

@@ -62,20 +62,28 @@ async def check_floor_plan(visit: Visit) -> list[Finding]:
 
 
 async def check_router(visit: Visit) -> list[Finding]:
-    """Whether a robot's zenoh router answers."""
+    """Whether a robot's zenoh router, and those that the bus is to connect to, answer."""
     robot = visit.settings.robot
-    if not isinstance(robot, Ros2Robot) or robot.endpoint is None:
-        return []
-    host, _, port = robot.endpoint.partition("/")[2].rpartition(":")
+    findings = []
+    if isinstance(robot, Ros2Robot) and robot.endpoint is not None:
+        remedy = "Is the robot on, and `ros2 run rmw_zenoh_cpp rmw_zenohd` running on it?"
+        findings.append(await _router(robot.endpoint, visit.listen_s, remedy))
+    for endpoint in visit.settings.bus.connect:
+        remedy = "Does that router run? Else take it out of bus: connect:"
+        findings.append(await _router(endpoint, visit.listen_s, remedy))
+    return findings
+
+
+async def _router(endpoint: str, patience_s: float, remedy: str) -> Finding:
+    host, _, port = endpoint.partition("/")[2].rpartition(":")
     try:
-        async with asyncio.timeout(visit.listen_s):
+        async with asyncio.timeout(patience_s):
             _, writer = await asyncio.open_connection(host.strip("[]"), int(port))
         writer.close()
     except (OSError, ValueError, TimeoutError) as error:
         why = "does not answer" if isinstance(error, TimeoutError) else str(error)
-        remedy = "Is the robot on, and `ros2 run rmw_zenoh_cpp rmw_zenohd` running on it?"
-        return [Finding("zenoh router", "bad", f"{robot.endpoint}: {why}", remedy)]
-    return [Finding("zenoh router", "ok", f"{robot.endpoint} answers")]
+        return Finding("zenoh router", "bad", f"{endpoint}: {why}", remedy)
+    return Finding("zenoh router", "ok", f"{endpoint} answers")
 
 
 async def check_robot(visit: Visit) -> list[Finding]:
