@@ -54,7 +54,7 @@ def test_still_frames_differ_by_noise_only() -> None:
     assert np.abs(a - b).max() < 30
 
 
-@pytest.mark.parametrize("seed", [1, 4])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_the_robot_is_drawn_where_it_is(seed: int) -> None:
     scenario, renderer = home(seed)
     for share in (0.3, 0.6):
