@@ -204,12 +204,13 @@ async def test_what_an_earlier_run_left_is_cleaned_up(bus: Bus, tmp_path: Path) 
     foreign = "homeassistant/sensor/other/config"
     with Mosquitto(tmp_path) as broker:
         async with Watcher(broker.port) as watcher:
-            for topic in (TOPICS.device_config(PHONE), TOPICS.device(PHONE), foreign):
+            for topic in (TOPICS.device_config(PHONE), TOPICS.device(PHONE), TOPICS.camera("old"), foreign):
                 await watcher.put(topic, b"{}", retain=True)
             await watcher.put(TOPICS.device_config(LAMP), b"{}", retain=True)
         async with Watcher(broker.port) as watcher, home_assistant(bus, tmp_path, broker.port):
             await watcher.until_says(TOPICS.device_config(PHONE), b"")
             await watcher.until_says(TOPICS.device(PHONE), b"")
+            await watcher.until_says(TOPICS.camera("old"), b"")
             await watcher.until_says(TOPICS.availability, b"online")
         kept = await retained_at(broker.port)
     assert TOPICS.device_config(PHONE) not in kept

@@ -15,7 +15,7 @@ import msgspec
 from vad import __version__
 from vad.bus import messages as m
 from vad.homeassistant.states import plain
-from vad.homeassistant.topics import Topics, safe_id
+from vad.homeassistant.topics import Topics
 
 Component = dict[str, Any]
 _DIAGNOSTIC: Component = {"entity_category": "diagnostic"}
@@ -110,8 +110,9 @@ def hub_announcement(camera: str, topics: Topics) -> bytes:
         "devices": of_status(
             "devices", "sensor", "Devices known", icon="mdi:devices", state_class="measurement"
         ),
-        f"camera_{safe_id(camera)}": entity(
-            f"camera_{safe_id(camera)}",
+        # One key whatever the camera is called: an entity that is only left out stays for good.
+        "camera": entity(
+            "camera",
             "sensor",
             "Camera calibration",
             device_class="enum",

@@ -71,15 +71,18 @@ def scene_of(
 
 async def draw(scene: bytes, cache: Path) -> bytes:
     """The PNG of a Scene; VadError where it cannot be drawn. cache: a folder for a list of fonts."""
-    process = await asyncio.create_subprocess_exec(
-        sys.executable,
-        "-m",
-        "vad.homeassistant.picture",
-        stdin=asyncio.subprocess.PIPE,
-        stdout=asyncio.subprocess.PIPE,
-        env=os.environ | {"OPENBLAS_NUM_THREADS": "1", "MPLCONFIGDIR": str(cache)},
-        start_new_session=True,
-    )
+    try:
+        process = await asyncio.create_subprocess_exec(
+            sys.executable,
+            "-m",
+            "vad.homeassistant.picture",
+            stdin=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.PIPE,
+            env=os.environ | {"OPENBLAS_NUM_THREADS": "1", "MPLCONFIGDIR": str(cache)},
+            start_new_session=True,
+        )
+    except OSError as error:
+        raise VadError(f"the map's picture cannot be drawn ({error.strerror})") from error
     try:
         async with asyncio.timeout(TIMEOUT_S):
             png, _ = await process.communicate(scene)

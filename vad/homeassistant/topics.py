@@ -74,9 +74,10 @@ class Topics:
         return f"{self.discovery}/status"
 
     @property
-    def retained(self) -> tuple[str, str]:
-        """Filters for what an earlier run may have left of devices that are no more."""
-        return f"{self.discovery}/device/{self.node}/+/config", self._own("devices", "+")
+    def retained(self) -> tuple[str, ...]:
+        """Filters for what an earlier run may have left of devices and cameras that are no more."""
+        own = (self._own(kind, "+") for kind in ("devices", "cameras"))
+        return f"{self.discovery}/device/{self.node}/+/config", *own
 
     def _own(self, *parts: str) -> str:
         return "/".join((self.base, safe_id(self.hub), *parts))
