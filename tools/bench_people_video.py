@@ -86,7 +86,7 @@ def follow_video(console: Console, path: str, frames: int, picture: str | None) 
         )
     console.print(table)
     if picture is not None:
-        cv2.imwrite(picture, draw(image, long, camera), [cv2.IMWRITE_PNG_COMPRESSION, 9])
+        cv2.imwrite(picture, draw(image, long, camera))
         console.print(f"drawn into {Path(picture).name}")
     return 0
 
