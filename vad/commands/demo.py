@@ -51,13 +51,15 @@ def demo(
     with contextlib.ExitStack() as stack:
         home = folder or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="vad-demo-")))
         home.mkdir(parents=True, exist_ok=True)
-        port = _free_port()
+        port, web_port = _free_port(), _free_port()
         endpoint = f"tcp/127.0.0.1:{port}"
         arguments = ["sim", "--dir", str(home), "--seed", str(seed), "--bus-port", str(port)]
+        arguments += ["--web-port", str(web_port)]
         stack.enter_context(_process([*arguments, *(["--fifo"] if fifo else [])], home / "sim.log"))
         config = home / "vad.yaml"
         _wait_for(config, START_S)
         daemon = stack.enter_context(_process(["run", "--config", str(config)], home / "daemon.log"))
+        out.print(f"watch it at http://127.0.0.1:{web_port}/", highlight=False)
         mapped = _watch(daemon, endpoint, home, time.monotonic() + timeout_s)
         truth = home / "truth.json"
         shown = subprocess.run(

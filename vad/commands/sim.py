@@ -20,6 +20,9 @@ def sim(
         typer.Option("--start-at", min=0, metavar="SECONDS", help="Begin this late in the home's own time."),
     ] = 0.0,
     bus_port: Annotated[int, typer.Option(help="Where the daemon's zenoh router shall listen.")] = 7447,
+    web_port: Annotated[
+        int | None, typer.Option(help="Where the daemon's page for browsers shall be.", show_default="none")
+    ] = None,
     fifo: Annotated[
         bool, typer.Option("--fifo", help="CSI through a FIFO even where netlink would be allowed.")
     ] = False,
@@ -32,17 +35,21 @@ def sim(
     Example:  vad sim --dir home --seed 3 &  vad run --config home/vad.yaml
     """
     with reported_errors():
-        asyncio.run(until_ended(_play(folder, seed, start_at_s, bus_port, fifo)))
+        asyncio.run(until_ended(_play(folder, seed, start_at_s, bus_port, web_port, fifo)))
 
 
-async def _play(folder: Path, seed: int, start_at_s: float, bus_port: int, fifo: bool) -> None:
+async def _play(
+    folder: Path, seed: int, start_at_s: float, bus_port: int, web_port: int | None, fifo: bool
+) -> None:
     from vad.sim.driver import ConnectorSender
     from vad.sim.home import SimulatedHome
     from vad.sim.scenario import make_home
 
     connector = not fifo and ConnectorSender.permitted()
     scenario = make_home(seed)
-    home = SimulatedHome(scenario, folder, bus_port=bus_port, connector=connector, start_at_s=start_at_s)
+    home = SimulatedHome(
+        scenario, folder, bus_port=bus_port, connector=connector, start_at_s=start_at_s, web_port=web_port
+    )
 
     async def announce(ready: asyncio.Event) -> None:
         await ready.wait()

@@ -78,15 +78,24 @@ class SimulatedHome:
 
     bus_port: where the daemon's zenoh router shall listen. connector: real NETLINK_CONNECTOR (needs the
     right to send to it) instead of a FIFO. start_at_s: the home's own time when `run` begins; what happened
-    before is past (a device that joined is listed).
+    before is past (a device that joined is listed). web_port: of the daemon's page for browsers, if it shall
+    have one.
     """
 
     def __init__(
-        self, scenario: Scenario, folder: Path, *, bus_port: int, connector: bool, start_at_s: float = 0.0
+        self,
+        scenario: Scenario,
+        folder: Path,
+        *,
+        bus_port: int,
+        connector: bool,
+        start_at_s: float = 0.0,
+        web_port: int | None = None,
     ) -> None:
         self._scenario = scenario
         self._folder = folder
         self._bus_port = bus_port
+        self._web_port = web_port
         self._connector = connector
         self._start_at_ns = int(start_at_s * 1e9)
         self._start_ns = 0
@@ -171,6 +180,7 @@ class SimulatedHome:
             },
             "devices": {"hostapd": ["hostapd.sock"]},
             "bus": {"listen": [f"tcp/127.0.0.1:{self._bus_port}"]},
+            "web": {"port": self._web_port},
         }
         draft = self._folder / "vad.yaml.new"
         draft.write_text(yaml.safe_dump(settings, sort_keys=False))
