@@ -156,9 +156,13 @@ function drawCameras() {
   layers.covered.replaceChildren();
   layers.cameras.replaceChildren();
   cameras.clear();
+  byId("legend-view").hidden = true;
   for (const [id, camera] of all("camera")) {
     if (!camera.position_m || camera.epoch !== map?.epoch) continue;
-    if (camera.floor_m) layers.covered.append(svg("polygon", { points: points(camera.floor_m) }));
+    if (camera.floor_m) {
+      layers.covered.append(svg("polygon", { points: points(camera.floor_m) }));
+      byId("legend-view").hidden = false;
+    }
     const node = svg("g", { class: "camera" }, svg("path", { d: "M4 -3 L11 -7 V7 L4 3 Z" }),
       svg("rect", { x: -8, y: -6, width: 13, height: 12, rx: 3 }), svg("title", { text: `Camera ${printable(id)}` }));
     layers.cameras.append(node);

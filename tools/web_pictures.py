@@ -1,0 +1,118 @@
+#!/usr/bin/env python3
+"""The README's pictures of the page: a simulated home after two days, measured by the daemon's own estimator.
+
+tools/web_pictures.py [FOLDER]: writes web_desktop.png and web_phone.png there (tools/pictures, if left out).
+Takes a few minutes; needs Chromium.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+import tempfile
+from pathlib import Path
+
+from bench_web_browser import Browser
+from bench_week_sim import Simulation, settings_for
+from PIL import Image
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "daemon"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "web"))
+
+from daemon_world import true_calibration
+from web_world import plan_message, status, until
+
+from vad.bus import messages as m
+from vad.bus.grid import grid_to_png
+from vad.bus.node import Bus
+from vad.bus.session import BusSettings
+from vad.daemon.registry import Registry
+from vad.daemon.wishes import Wishes
+from vad.mapping.camera_floor import floor_in_picture
+from vad.sim.household import DAY_S, Household, make_household
+from vad.store.worker import StoreWorker
+from vad.web.access import Access
+from vad.web.home import HomeFeed, Robot
+from vad.web.server import PageServer
+
+DAYS = 2
+SCREENS = {"web_desktop": (1280, 800, False), "web_phone": (390, 844, True)}
+COLOURS = 200
+"""Of a picture's palette: a third of the bytes, and nobody sees it."""
+
+
+def camera(house: Household) -> m.CameraMessage:
+    """The home's camera, as after a drive of the robot."""
+    known = true_calibration(house.home)
+    assert known.position_m is not None
+    assert known.camera_from_map is not None
+    turn = known.camera_from_map.inverse().rotation.tolist()
+    x_m, y_m, z_m = known.position_m.tolist()
+    return m.CameraMessage(
+        source="simulated",
+        id="main",
+        state="valid",
+        percent=100,
+        position_m=(x_m, y_m, z_m),
+        map_from_camera=(tuple(turn[0]), tuple(turn[1]), tuple(turn[2])),
+        deviation_m=known.deviation_m,
+        epoch=house.plan.epoch,
+        floor_m=floor_in_picture(known, house.plan.bounds_m),
+    )
+
+
+async def show(house: Household, folder: Path, pictures: Path) -> None:
+    """Serve what the days left in the store, and photograph it."""
+    bus = Bus(BusSettings(), source="simulated")
+    async with StoreWorker(folder / "vad.sqlite") as store:
+        registry = Registry(settings_for(folder, 200), house.plan, bus, store)
+        await registry.load()
+        for device in house.devices:
+            await registry.joined(device.mac, device.name)
+        bus.publish_map(plan_message(house.plan))
+        bus.publish_grid(grid_to_png(house.plan.cells))
+        bus.publish_camera(camera(house))
+        parts = (m.Part(part="robot", state="ok"),)
+        bus.publish_status(status("waiting for somebody to walk through the picture", parts=parts))
+        x_m, y_m, yaw_rad = map(float, house.home.robot_at(house.home.drive_start_s + 20))
+        robot = Robot(status="localised", x_m=x_m, y_m=y_m, yaw_rad=yaw_rad, epoch=house.plan.epoch)
+        wishes = Wishes(bus.keys, registry, "simulated")
+        page = PageServer(Access(0), "home", HomeFeed(bus.keys, bus.listen), wishes.answer, lambda: robot)
+        running = asyncio.create_task(page.run())
+        try:
+            await until(lambda: page.health.state == "ok", "the page listens")
+            async with Browser() as browser:
+                for name, (width, height, phone) in SCREENS.items():
+                    shown = await browser.page(width, height, dark=phone, phone=phone)
+                    await shown.go(f"http://127.0.0.1:{page.port}/")
+                    await shown.until(f"document.querySelectorAll('.row').length >= {len(house.devices)}")
+                    await shown.until("document.querySelector('.robot:not([visibility])')")
+                    if phone:
+                        await shown.click(f".row[data-mac='{house.devices[9].mac}']")
+                        await shown.value("document.activeElement.blur(); scrollTo(0, 0)")
+                        await shown.until("document.querySelector('.heat image')")
+                    await asyncio.sleep(1)  # pictures come, labels find their places
+                    await shown.picture(pictures / f"{name}.png")
+                    shrink(pictures / f"{name}.png")
+        finally:
+            running.cancel()
+            await asyncio.wait({running})
+
+
+def shrink(path: Path) -> None:
+    """Store a picture with a small palette's worth of colours."""
+    Image.open(path).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE).save(path, optimize=True)
+
+
+def main() -> None:
+    """Simulate, then photograph."""
+    pictures = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent / "pictures"
+    house = make_household(1, days=DAYS, moved_after_s=1.2 * DAY_S, joined_within_s=0.5 * DAY_S)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        asyncio.run(Simulation(house, DAYS, folder, settings_for(folder, 200)).run())
+        asyncio.run(show(house, folder, pictures))
+
+
+if __name__ == "__main__":
+    main()
