@@ -95,3 +95,10 @@ class Broker(RuleBasedStateMachine):
 
 
 TestBroker = Broker.TestCase
+
+
+def test_what_is_wanted_already_is_no_news() -> None:
+    retained = Retained(lambda _: EVERY_NS)
+    assert retained.want("a", b"1")
+    assert not retained.want("a", b"1")
+    assert retained.want("a", b"2")

@@ -94,7 +94,10 @@ class HomeAssistant:
         elif form is not None and parsed.kind == "status":
             self._status = m.decode(form.payload, m.StatusMessage)
             self._say_status()
-        self._news.set()
+
+    def _want(self, topic: str, payload: bytes) -> None:
+        if self._retained.want(topic, payload):
+            self._news.set()
 
     def _hear_floor(self, kind: str, form: Form) -> None:
         if kind == "map":
@@ -104,7 +107,7 @@ class HomeAssistant:
         else:
             camera = m.decode(form.payload, m.CameraMessage)
             self._cameras[camera.id] = camera
-            self._retained.want(self._topics.camera(camera.id), camera_state(camera))
+            self._want(self._topics.camera(camera.id), camera_state(camera))
         self._floor_news.set()
 
     def _hear_device(self, mac: str, form: Form | None) -> None:
@@ -113,16 +116,17 @@ class HomeAssistant:
             self._devices.pop(mac, None)
             self._retained.drop(topics.device_config(mac))
             self._retained.drop(topics.device(mac))
+            self._news.set()
         else:
             device = m.decode(form.payload, m.DeviceMessage)
             self._devices[mac] = device
-            self._retained.want(topics.device_config(mac), device_announcement(device, topics))
-            self._retained.want(topics.device(mac), device_state(device))
+            self._want(topics.device_config(mac), device_announcement(device, topics))
+            self._want(topics.device(mac), device_state(device))
         self._say_status()
         self._floor_news.set()
 
     def _say_status(self) -> None:
-        self._retained.want(self._topics.status, status_state(self._status, self._devices.values()))
+        self._want(self._topics.status, status_state(self._status, self._devices.values()))
 
     async def _keep_connected(self) -> None:
         """Connect, and again where the connection ends, until cancelled."""
@@ -160,9 +164,9 @@ class HomeAssistant:
                 listener.cancel()
                 teller.cancel()
                 await asyncio.wait({listener, teller})
-            for task in (listener, teller):
-                if not task.cancelled():
-                    task.result()
+            failed = [task.exception() for task in (listener, teller) if not task.cancelled()]
+            if error := next(filter(None, failed), None):
+                raise error
 
     async def _listen(self, client: aiomqtt.Client) -> None:
         """Hear of Home Assistant's start, and of what an earlier run left."""
@@ -223,6 +227,5 @@ class HomeAssistant:
                 _log.warning("Home Assistant: %s", error)
             else:
                 drawn = scene
-                self._retained.want(self._topics.map, png)
-                self._news.set()
+                self._want(self._topics.map, png)
             await asyncio.sleep(PICTURE_EVERY_S)

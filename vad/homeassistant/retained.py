@@ -21,9 +21,11 @@ class Retained:
         self._sent: dict[str, bytes] = {}
         self._sent_ns: dict[str, int] = {}
 
-    def want(self, topic: str, payload: bytes) -> None:
-        """The broker is to retain this."""
+    def want(self, topic: str, payload: bytes) -> bool:
+        """The broker is to retain this; False where that is nothing new."""
+        news = self._wanted.get(topic) != payload
         self._wanted[topic] = payload
+        return news
 
     def drop(self, topic: str) -> None:
         """The broker is to forget this topic; nothing where that was never wanted."""
