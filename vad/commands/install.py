@@ -128,7 +128,7 @@ def uninstall(
         link = Path("/usr/local/bin/vad")
         if link.is_symlink() and link.resolve() == _program():
             steps.remove_tree(link)
-        steps.run("systemctl", "daemon-reload")
+        steps.run("systemctl", "daemon-reload", may_fail=True)
         if purge:
             for folder in ("/etc/vad", "/var/lib/vad", "/var/lib/vad-agent", "/var/lib/private/vad-agent"):
                 steps.remove_tree(Path(folder))

@@ -36,13 +36,15 @@ class Worker:
     done: Callable[[], int]
     patience_s: float
     seen: int = field(default=-1, init=False)
+    waited: bool = field(default=False, init=False)
     stalled_s: float = field(default=0.0, init=False)
 
     def look(self, passed_s: float) -> bool:
         """Whether it is stuck, `passed_s` after the last look."""
-        done = self.done()
-        self.stalled_s = self.stalled_s + passed_s if self.waiting() and done == self.seen else 0.0
-        self.seen = done
+        done, waiting = self.done(), self.waiting()
+        untouched = waiting and self.waited and done == self.seen
+        self.stalled_s = self.stalled_s + passed_s if untouched else 0.0
+        self.seen, self.waited = done, waiting
         return self.stalled_s >= self.patience_s
 
 
