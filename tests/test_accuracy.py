@@ -59,7 +59,7 @@ def test_a_home() -> None:
 def test_recordings() -> None:
     """Three real walks around one receiver in the plain room."""
     single, fused = judged(partial(recorded, ("plain", "rx1"), 3), "as recorded")
-    assert worst_m(single) < 0.8
+    assert worst_m(single) < 1.1
     assert error_m(fused) < 0.45
     assert sum(bool(s.in90) for s in single) >= 2
 

@@ -14,6 +14,7 @@ from vad.mapping.doppler_likelihood import SPEED_OF_LIGHT_MPS, DopplerModel, log
 from vad.mapping.doppler_search import OFFSETS_S, DopplerSearch
 from vad.mapping.evidence import Terms
 from vad.mapping.height import height_log_likelihood
+from vad.mapping.loudness import loudness_log_likelihood
 from vad.mapping.paper import THRESHOLD_OFFICE_M, algorithm_1
 from vad.mapping.posterior import Grid, Posterior
 from vad.mapping.walk import WalkTrack
@@ -164,7 +165,10 @@ def _terms(
     sums = None
     if phases is not None:
         sums = arrival_sums(phases, walk, points, wavelength_m=search.wavelength_m)
-    terms = Terms(grid, 1, doppler, log_heard(points, walk), sums)
+    loudness = loudness_log_likelihood(
+        search.spectra, walk, search.anchor_m, points, anchor_z_m=search.anchor_z_m
+    )
+    terms = Terms(grid, 1, doppler + loudness, log_heard(points, walk), sums)
     height = height_log_likelihood(search, points, terms.log_density(), doppler, offset_s)
     return replace(terms, height=height)
 

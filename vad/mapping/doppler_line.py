@@ -27,7 +27,7 @@ class LineModel:
     the walls do to the ridge, and for how long.
     """
 
-    kappa: float = 0.945
+    kappa: float = 0.957
     kappa_sd: float = 0.03
     surface_m: float = 0.1
     surface_sd_m: float = 0.06

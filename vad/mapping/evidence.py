@@ -28,9 +28,9 @@ independent ones (method.md 3). Chosen on the plain-room recordings so that 90 %
 class Terms:
     """Sums over `walks` walks on one grid of G candidates.
 
-    doppler (G,): log-likelihood of the spectrograms; heard (G,): log of how loud the walks would have been;
-    arrival (G, P, B, B) float32: see arrival_sums; None where the device has no antennas to compare;
-    height (7,): see height_log_likelihood; None where no walk could tell.
+    doppler (G,): log-likelihood of the spectrograms and of how their loudness changes; heard (G,): log of how
+    loud the walks would have been; arrival (G, P, B, B) float32: see arrival_sums; None where the device has
+    no antennas to compare; height (7,): see height_log_likelihood; None where no walk could tell.
     """
 
     grid: Grid

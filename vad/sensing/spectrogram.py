@@ -17,6 +17,7 @@ SIGNAL_SHARE = 0.85
 """l = log(0.85 N P + 0.15): a frame may hold no ridge of the walker at all in 15 % of cases."""
 
 _FFT = 512
+_SILENCE = 1e-12
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +27,7 @@ class Spectrogram:
     t_ns int64 (F,): frame centres on the timeline; f_hz (B,): ascending, -MAX_DOPPLER_HZ..; the path length
     change rate is -lambda * f_hz. power (F, B): smoothed, mean 1 in each frame; log_likelihood (F, B):
     log(SIGNAL_SHARE * power + 1 - SIGNAL_SHARE); weight (F,): 0..1, the share of the window that packets
-    cover (0 where there was a hole).
+    cover (0 where there was a hole). level_db (F,): how loud what moves is, from an unknown zero on.
     """
 
     t_ns: NDArray[np.int64]
@@ -34,16 +35,19 @@ class Spectrogram:
     power: NDArray[np.float64]
     log_likelihood: NDArray[np.float64]
     weight: NDArray[np.float64]
+    level_db: NDArray[np.float64]
 
 
 def combined(first: Spectrogram, second: Spectrogram) -> Spectrogram:
-    """Two views of the same frames: the mean of their powers and of their log-likelihoods."""
+    """Two views of the same frames: the mean of their powers and of their log-likelihoods, the second's
+    level."""
     return Spectrogram(
         first.t_ns,
         first.f_hz,
         (first.power + second.power) / 2,
         (first.log_likelihood + second.log_likelihood) / 2,
         np.minimum(first.weight, second.weight),
+        second.level_db,
     )
 
 
@@ -62,12 +66,15 @@ def spectrogram(streams: UniformStreams) -> Spectrogram:
     keep = keep[np.argsort(f_all[keep])]
     power = np.zeros((len(starts), len(keep)))
     weight = np.zeros(len(starts))
+    level = np.full(len(starts), _SILENCE)
     for k, start in enumerate(starts):
         window = values[start : start + width]
         if len(window) < width:
             continue
         weight[k] = streams.covered[start : start + width].mean()
-        spectrum = np.fft.fft((window - window.mean(axis=0)) * hann, n=_FFT, axis=0)[keep]
+        moving = window - window.mean(axis=0)
+        level[k] = max(_SILENCE, float(np.mean(np.abs(moving) ** 2)))
+        spectrum = np.fft.fft(moving * hann, n=_FFT, axis=0)[keep]
         energy = np.abs(spectrum) ** 2
         total = energy.sum(axis=0)
         good = total > 0
@@ -78,7 +85,8 @@ def spectrogram(streams: UniformStreams) -> Spectrogram:
     weight = np.where(weight > 0.8, weight, 0.0)
     log_likelihood = np.log(SIGNAL_SHARE * power + 1 - SIGNAL_SHARE)
     centres = np.minimum(starts + width // 2, len(streams.t_ns) - 1)
-    return Spectrogram(streams.t_ns[centres], f_hz, power, log_likelihood, weight)
+    level_db = 10 * np.log10(level)
+    return Spectrogram(streams.t_ns[centres], f_hz, power, log_likelihood, weight, level_db)
 
 
 def _smooth(power: NDArray[np.float64], f_hz: NDArray[np.float64]) -> NDArray[np.float64]:
