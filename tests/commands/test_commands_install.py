@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -117,3 +119,13 @@ def test_a_place_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(VadError, match="cannot be written"):
         Told().steps.write(tmp_path / "file" / "unit", MARK)
+
+
+def test_the_daemon_does_not_load_what_draws() -> None:
+    """matplotlib takes a third of a second at every start, and builds a list of fonts at the first."""
+    program = (
+        "import sys; import vad.commands.app, vad.daemon.app; "
+        "sys.exit(any(m.partition('.')[0] == 'matplotlib' for m in sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, check=False, timeout=50)
+    assert done.returncode == 0, done.stderr.decode()

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -28,7 +29,6 @@ from vad.commands.console import (
 from vad.commands.devices import read_truth
 from vad.commands.map_files import export, import_, show
 from vad.errors import VadError
-from vad.report.floor import Floor, save_floor
 from vad.report.words import metres, printable
 
 map_app = typer.Typer(invoke_without_command=True, subcommand_metavar="[import|export|show ...]")
@@ -74,15 +74,17 @@ def map_(
         if png is None and svg is None:
             _print_summary(plan, found, cameras)
             return
+        from vad.report.floor import Floor, save_floor  # matplotlib: the daemon must not load it
+
         floor = Floor(plan, None if picture is None else png_to_grid(picture), found, cameras, places)
         for path in (png, svg):
             if path is not None:
-                _save(floor, path)
+                _save(partial(save_floor, floor), path)
 
 
-def _save(floor: Floor, path: Path) -> None:
+def _save(draw: Callable[[Path], None], path: Path) -> None:
     try:
-        save_floor(floor, path)
+        draw(path)
     except OSError as error:
         raise VadError(f"cannot be written: {error.strerror}", where=str(path)) from error
     out.print(Text(f"wrote {path}"), soft_wrap=True)

@@ -24,7 +24,6 @@ from vad.commands.console import (
     reported_errors,
 )
 from vad.errors import SourceError, VadError
-from vad.report.floor import Floor, save_floor
 from vad.report.words import printable
 from vad.robot.floor_plan import FREE, OCCUPIED, UNKNOWN, FloorPlan
 from vad.robot.floor_plan import Room as PlanRoom
@@ -109,6 +108,8 @@ def show(
                     for room in plan.rooms
                 ),
             )
+            from vad.report.floor import Floor, save_floor  # matplotlib: the daemon must not load it
+
             try:
                 save_floor(Floor(outline, plan.cells, [], [], {}), png)
             except OSError as error:
