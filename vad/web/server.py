@@ -80,9 +80,9 @@ class PageServer:
             keepalive_timeout=IDLE_S,
             shutdown_timeout=END_S,
         )
-        await runner.setup()
         server: asyncio.Server | None = None
         try:
+            await runner.setup()
             server = await self._listen(runner)
             await self._follow_robot()
         finally:
