@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from functools import partial
@@ -31,6 +32,7 @@ from vad.capture.session import (
 from vad.capture.session_writer import SessionWriter
 from vad.config import Settings, parse_settings
 from vad.csi.heard import NOT_HEARD
+from vad.csi.packets import CsiBatch
 from vad.daemon.decisions import Decision, DecisionLog
 from vad.daemon.measuring import Hearing, Measuring
 from vad.daemon.registry import Registry
@@ -96,11 +98,18 @@ class _Bus(Bus):
 class Simulation:
     """Plays a household's days, one visit after the other."""
 
-    def __init__(self, house: Household, days: int, folder: Path, settings: Settings) -> None:
+    def __init__(
+        self,
+        house: Household,
+        days: int,
+        folder: Path,
+        settings: Settings,
+        make_bus: Callable[[Week], _Bus] | None = None,
+    ) -> None:
         self.week = Week(house, days)
         self._house = house
         self._settings = settings
-        self._bus = _Bus(self.week)
+        self._bus = (make_bus or _Bus)(self.week)
         self._store = StoreWorker(folder / "vad.sqlite")
         self._archive = folder / "sessions"
         self._registry = Registry(settings, house.plan, self._bus, self._store)
@@ -237,11 +246,14 @@ class Simulation:
         rates = {mac: shared if mac in provoked else BUSY_PER_S for mac in macs}
         headers = [self._header(self._device(mac), from_s) for mac in macs]
         writer = SessionWriter(self._archive / headers[0].id, headers[0], headers[1:])
-        writer.append(hear(self._house, visit, rates, from_s, to_s))
+        writer.append(self._hear(visit, rates, from_s, to_s))
         seen = seen_walk(visit.walk, NOISE, self._rng)
         inside = (seen.t_ns >= _ns(from_s)) & (seen.t_ns <= _ns(to_s))
         writer.close(seen.t_ns[inside], seen.xy_m[inside], seen.sigma_m[inside], TRACK)
         return writer.folders
+
+    def _hear(self, visit: Visit, rates: dict[str, float], from_s: float, to_s: float) -> CsiBatch:
+        return hear(self._house, visit, rates, from_s, to_s)
 
     def _header(self, device: HomeDevice, t_s: float) -> SessionHeader:
         return SessionHeader(
