@@ -1,0 +1,164 @@
+"""The Debian package in a bare Debian 12: installs without any network, keeps settings, purges clean."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500)]
+
+ROOT = Path(__file__).resolve().parents[1]
+NEEDED = ("mmdebstrap", "dpkg-deb", "chroot", "mount")
+DEPENDS = "python3.11,libstdc++6,zlib1g,libusb-1.0-0,systemd,udev"
+MOST_MB = 200
+"""What a hub has to fetch."""
+IGNORED = ("var/log", "var/lib/dpkg", "var/cache", "proc", "run", "root", "tmp", "dev", "etc/.pwd.lock")
+USERS = ("etc/passwd-", "etc/group-", "etc/shadow-", "etc/gshadow-", "etc/subuid-", "etc/subgid-")
+
+
+@pytest.fixture(scope="module")
+def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The package of this checkout; VAD_DEB names one that is built already."""
+    missing = [tool for tool in NEEDED if shutil.which(tool) is None]
+    if missing:
+        pytest.skip(f"no {', '.join(missing)}: apt-get install mmdebstrap dpkg mount")
+    if os.geteuid() != 0:
+        pytest.skip("a root folder of Debian's needs root")
+    if given := os.environ.get("VAD_DEB"):
+        return Path(given)
+    folder = tmp_path_factory.mktemp("package")
+    build = [str(ROOT / "tools" / "deb" / "build"), "--out", str(folder)]
+    done = subprocess.run(build, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return Path(done.stdout.split()[-1])
+
+
+class Debian:
+    """A bare Debian 12 in a folder; no network, no compiler."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    def run(self, *command: str, code: int = 0) -> str:
+        """What a program in it says."""
+        done = subprocess.run(
+            ["unshare", "--net", "chroot", self.root, "env", "-i", "PATH=/usr/sbin:/usr/bin", *command],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == code, done.stdout + done.stderr
+        return done.stdout + done.stderr
+
+    def files(self) -> set[str]:
+        """Every path, with whose it is and who may what; dpkg's own books, logs and caches left out."""
+        found = set()
+        for folder, folders, names in os.walk(self.root):
+            inside = Path(folder).relative_to(self.root)
+            folders[:] = [name for name in folders if not str(inside / name).startswith(IGNORED)]
+            for name in [*folders, *names]:
+                path = inside / name
+                if str(path) in USERS or str(path).startswith(IGNORED) or path.suffix == ".pyc":
+                    continue
+                about = (self.root / path).lstat()
+                found.add(f"{path} {about.st_uid}:{about.st_gid} {about.st_mode:o}")
+        return found
+
+
+@pytest.fixture(scope="module")
+def debian(package: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Debian]:
+    """With what the package depends on."""
+    assert package.is_file()
+    root = tmp_path_factory.mktemp("debian") / "root"
+    made = subprocess.run(
+        ["mmdebstrap", "--quiet", "--variant=minbase", "--mode=root", "--skip=check/empty",
+         f"--include={DEPENDS}", '--aptopt=APT::Install-Recommends "false"', "--dpkgopt=force-unsafe-io",
+         "--dpkgopt=path-exclude=/usr/share/man/*", "bookworm", str(root)],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert made.returncode == 0, made.stderr[-2000:]
+    subprocess.run(["mount", "--bind", "/proc", root / "proc"], check=True)
+    try:
+        yield Debian(root)
+    finally:
+        subprocess.run(["umount", root / "proc"], check=True)
+
+
+def test_it_is_not_too_large_and_carries_no_path_of_the_builder(package: Path, tmp_path: Path) -> None:
+    assert package.stat().st_size < MOST_MB * 1_000_000
+    subprocess.run(["dpkg-deb", "--extract", package, tmp_path], check=True)
+    told = subprocess.run(
+        ["grep", "-rlI", "--", str(ROOT), tmp_path], capture_output=True, text=True, check=False
+    )
+    assert told.stdout == ""
+    programs = {file.name for file in (tmp_path / "usr" / "lib" / "vad" / "bin").iterdir()}
+    assert programs == {"python", "python3", "python3.11", "vad"}
+
+
+def test_it_installs_upgrades_and_leaves_nothing(package: Path, debian: Debian, tmp_path: Path) -> None:
+    before = debian.files()
+    shutil.copy(package, debian.root / "root" / "vad.deb")
+    said = debian.run("dpkg", "-i", "/root/vad.deb")
+    assert "Next: sudo vad setup" in said
+    assert set(debian.run("id", "-nG", "vad").split()) == {"vad", "dialout", "netdev", "video"}
+    for unit in ("vad.service", "vad-agent.service"):
+        assert (debian.root / "etc/systemd/system/multi-user.target.wants" / unit).is_symlink()
+
+    # It runs, from its own environment: everything it imports is there.
+    assert debian.run("vad", "--version").strip()
+    modules = (
+        "import vad.daemon.app, vad.agent.node, vad.web.server, vad.homeassistant.broker, vad.report.floor"
+    )
+    debian.run("/usr/lib/vad/bin/python", "-I", "-c", modules)
+    assert "cannot be read (No such file or directory)" in debian.run("vad", "check-config", code=2)
+
+    # The example is a usable file; what is written in /etc/vad is the service's group's.
+    settings = debian.root / "etc/vad/vad.yaml"
+    debian.run(
+        "sh", "-c", "cp /usr/share/doc/vad/examples/vad.yaml /etc/vad/ && echo '# mine' >> /etc/vad/vad.yaml"
+    )
+    assert "the settings are usable" in debian.run("vad", "check-config")
+    assert debian.run("stat", "-c", "%G", "/etc/vad/vad.yaml").strip() == "vad"
+    debian.run("sh", "-c", "echo kept > /var/lib/vad/vad.sqlite")
+
+    # A later version keeps them, and an administrator's will.
+    mine = settings.read_bytes()
+    debian.run("systemctl", "disable", "vad-agent.service")
+    debian.run("dpkg", "-i", f"/root/{later(package, debian.root / 'root', tmp_path)}")
+    assert debian.run("dpkg-query", "-W", "-f", "${Version}", "vad").endswith("+later")
+    assert settings.read_bytes() == mine
+    wants = debian.root / "etc/systemd/system/multi-user.target.wants"
+    assert (wants / "vad.service").is_symlink()
+    assert not (wants / "vad-agent.service").is_symlink()
+
+    debian.run("dpkg", "-r", "vad")
+    assert settings.read_bytes() == mine
+    assert (debian.root / "var/lib/vad/vad.sqlite").read_text() == "kept\n"
+    assert not (debian.root / "usr/lib/vad").exists()
+    debian.run("dpkg", "-P", "vad")
+    after = debian.files()
+    assert {line for line in after - before if "/etc/netdev" not in line} == set()
+    assert before - after == set()
+    debian.run("id", "vad", code=1)
+
+
+def later(package: Path, folder: Path, tmp_path: Path) -> str:
+    """The same package with a later version; its name in `folder`."""
+    tree = tmp_path / "tree"
+    subprocess.run(["dpkg-deb", "--raw-extract", package, tree], check=True)
+    control = tree / "DEBIAN" / "control"
+    control.write_text(
+        "\n".join(
+            f"{line}+later" if line.startswith("Version:") else line
+            for line in control.read_text().splitlines()
+        )
+        + "\n"
+    )
+    build = ["dpkg-deb", "--root-owner-group", "-Zzstd", "-z1", "--build", tree, folder / "later.deb"]
+    subprocess.run(build, check=True, capture_output=True)
+    return "later.deb"
