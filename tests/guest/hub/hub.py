@@ -250,7 +250,9 @@ def restart(name: str, sign: signal.Signals, timeout_s: float) -> None:
         found["restarted_s"] = round(time.monotonic() - begun_s, 1)
         until(lambda: service.active and service.pid not in (0, pid), "that it is ready again", PATIENCE_S)
         found["active_s"] = round(time.monotonic() - begun_s, 1)
-        found["answers_s"] = until(lambda: hub.device(MAC), "the device", SOON_S)
+        found["answers_s"] = until(
+            lambda: hub.device(MAC) and hub.camera(), "what was known, told again", SOON_S
+        )
         found["after"] = known()
         found["parts_s"] = until(
             lambda: all(hub.is_in(part, "ok") for part in PARTS),
