@@ -82,7 +82,8 @@ class HttpStreamCamera:
 
     async def _stream(self, out: DropOldestQueue[Frame]) -> None:
         async with asyncio.timeout(CONNECT_TIMEOUT_S):
-            reader, writer = await asyncio.open_connection(self._host, self._port, limit=MAX_HEAD_BYTES)
+            # A picture fits: the connection is not stopped and started again for each.
+            reader, writer = await asyncio.open_connection(self._host, self._port, limit=_READ_BYTES)
         waiting: DropOldestQueue[Undecoded] = DropOldestQueue(_WAITING)
         clock = StreamClock()
         pool = ThreadPoolExecutor(1, thread_name_prefix="decode")
@@ -108,9 +109,12 @@ class HttpStreamCamera:
             writer.write(self._request)
             await writer.drain()
             try:
-                head = parse_response_head(await reader.readuntil(b"\r\n\r\n"))
+                raw = await reader.readuntil(b"\r\n\r\n")
             except asyncio.LimitOverrunError as error:
                 raise ProtocolError("the answer's head is too long") from error
+            if len(raw) > MAX_HEAD_BYTES:
+                raise ProtocolError("the answer's head is too long")
+            head = parse_response_head(raw)
         if head.status != 200:
             remedy = "put user and password into the address" if head.status == 401 else ""
             raise SourceError(f"the camera answers {head.status} {head.reason}".strip(), remedy=remedy)

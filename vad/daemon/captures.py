@@ -46,6 +46,8 @@ from vad.store.records import DeviceRecord
 _log = logging.getLogger(__name__)
 
 TICK_S = 0.1
+IDLE_TICK_S = 0.5
+"""While nobody moves; who begins to move ends the wait."""
 UNWRITABLE_PAUSE_S = 5.0
 """Before the next try where no session folder can be made."""
 STOPPED = "the daemon stopped"
@@ -67,6 +69,7 @@ class Captures:
     ) -> None:
         self.step = "starting"
         self.turns = 0
+        self._stirred = asyncio.Event()
         self._settings = settings
         self._plan = plan
         self._eyes = eyes
@@ -103,23 +106,41 @@ class Captures:
     def joined(self, mac: str) -> None:
         """The device joined the network, for the first time or again."""
         self._measuring.joined(mac, time.monotonic_ns())
+        self._stirred.set()
 
     async def run(self) -> None:
         """Measure devices until cancelled."""
+        unlisten = self._eyes.listen(self._look_up)
+        provoking = False
         try:
             await self._tidy_up()
             while True:
-                await asyncio.sleep(TICK_S)
+                await self._next_turn(busy=provoking or bool(self._eyes.movers()))
                 self.turns += 1
                 decision = await self._decide(time.monotonic_ns())
+                provoking = bool(decision.provoke)
                 await self._traffic.towards(decision.provoke)
                 if decision.record and decision.track is not None:
                     await self._capture(decision.record, decision.track)
                 await self._decisions.flush()
         finally:
+            unlisten()
             await self._traffic.stop()
             await self._solver.close()
             await self._decisions.close()
+
+    def _look_up(self, _t_ns: int) -> None:
+        if self._eyes.movers():
+            self._stirred.set()
+
+    async def _next_turn(self, *, busy: bool) -> None:
+        if busy:
+            await asyncio.sleep(TICK_S)
+        else:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(IDLE_TICK_S):
+                    await self._stirred.wait()
+        self._stirred.clear()
 
     async def _decide(self, now_ns: int) -> Decision:
         calibration = self._eyes.calibration
