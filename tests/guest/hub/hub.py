@@ -115,6 +115,8 @@ def start() -> None:
         found |= service.show("ActiveState", "SubState", "Type", "User", "WatchdogUSec", "StatusText")
         found["ready_s"] = service.started_in_s()
         found["answers_s"] = until(hub.status, "an answer over zenoh", SOON_S)
+        # Until it has loaded what it knows, it speaks of the robot and the store alone.
+        until(lambda: hub.is_in("camera", "ok", "degraded", "failed"), "a word of the camera", SOON_S)
         status = hub.status()
         found["parts"] = {p.part: f"{p.state}: {p.detail}" for p in status.parts} if status else {}
         found["as user"] = Path(f"/proc/{service.pid}/status").read_text().split("Uid:")[1].split()[0]
