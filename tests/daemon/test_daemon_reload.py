@@ -139,6 +139,7 @@ def names(client: VadClient) -> dict[str, str | None]:
         return {}
 
 
+@pytest.mark.slow
 def test_names_ignored_devices_and_limits_change_at_once(service: Service) -> None:
     with connected(service.port) as client:
         wait_for(lambda: names(client) == {LAMP: "Lamp"}, "the lamp", WAIT_S)
@@ -160,6 +161,7 @@ def test_names_ignored_devices_and_limits_change_at_once(service: Service) -> No
     service.end()
 
 
+@pytest.mark.slow
 def test_another_port_begins_anew_in_the_same_process(service: Service) -> None:
     pid, port = service.process.pid, free_port()
     service.write(bus={"listen": [f"tcp/127.0.0.1:{port}"]})
@@ -187,6 +189,7 @@ def test_a_file_that_cannot_be_used_is_refused_and_the_old_settings_go_on(servic
     service.end()
 
 
+@pytest.mark.slow
 def test_settings_that_cannot_start_give_way_to_those_of_before(service: Service) -> None:
     with (
         socket.create_server(("127.0.0.1", 0)) as taken,
