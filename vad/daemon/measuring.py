@@ -28,6 +28,7 @@ from vad.wall import now_rfc3339, seconds_between
 
 _WAITING = ("discovered", "waiting", "stale", "capturing")
 """States in which a device says what it waits for; a mapped or a failed one keeps what it says."""
+AWAY = "it is not in the network now"
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,6 +128,9 @@ class Measuring:
         return (self._registry.knows(mac) and self._registry.get(mac).name) or mac
 
     def _candidate(self, record: DeviceRecord, hearing: Hearing) -> Candidate:
+        if hearing.per_s < MIN_PACKETS_PER_S and self._registry.away(record.mac):
+            # Guests come once and are never heard again: nobody's walk is spent on asking after them.
+            hearing = Hearing(hearing.per_s, False, AWAY)
         return Candidate(
             record.mac,
             record.name or record.mac,

@@ -251,6 +251,11 @@ class Registry:
         """The address that the device sends with."""
         return device.current_mac if (device := self.roster.table.find(mac)) else mac
 
+    def away(self, mac: str) -> bool:
+        """Whether the device was seen to leave the network and is not back."""
+        device = self.roster.table.find(mac)
+        return mac in self._left_ns and device is not None and not self.roster.table.in_network(device)
+
     def ip_of(self, mac: str) -> str | None:
         """The device's IPv4 address, where it is known."""
         return device.ip if (device := self.roster.table.find(mac)) else None
