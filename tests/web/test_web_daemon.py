@@ -42,13 +42,13 @@ async def test_a_walk_is_seen_while_it_is_measured_and_the_place_appears(tmp_pat
         str(START_AT_S),
     ]
     with Vad("sim", *map(str, arguments), log=tmp_path / "sim.log") as sim:
-        await until(settings.exists, "the home's settings", 30)
+        await until(settings.exists, "the home's settings", 90)
         store_calibration(folder / "state", HOME)
         write_token(folder / "web.token")
         change_settings(settings, web={"port": web, "token_file": "web.token"})
         with Vad("run", "--config", settings, log=tmp_path / "daemon.log") as vad:
             async with Browser() as browser:
-                await until(lambda: answers(web), "the page", 60)
+                await until(lambda: answers(web), "the page", 90)
                 page = await browser.page()
                 await page.go(f"http://127.0.0.1:{web}/")
                 await page.until("document.querySelector('#source').textContent === 'simulated'", 30)
