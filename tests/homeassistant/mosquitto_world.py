@@ -122,7 +122,7 @@ class Watcher:
     async def put(self, topic: str, payload: bytes, *, retain: bool = False) -> None:
         await self._client.publish(topic, payload, qos=1, retain=retain)
 
-    async def until(self, condition: Callable[[], bool], what: str, timeout_s: float = 15.0) -> None:
+    async def until(self, condition: Callable[[], bool], what: str, timeout_s: float = 40.0) -> None:
         try:
             async with asyncio.timeout(timeout_s):
                 while not condition():
@@ -133,7 +133,7 @@ class Watcher:
                 f"not in {timeout_s:.0f} s: {what}; topics: {sorted(self.payloads)}"
             ) from None
 
-    async def until_says(self, topic: str, payload: bytes, timeout_s: float = 15.0) -> None:
+    async def until_says(self, topic: str, payload: bytes, timeout_s: float = 40.0) -> None:
         said = f"{topic} {payload[:60]!r}"
         await self.until(lambda: self.payloads.get(topic) == payload, said, timeout_s)
 
