@@ -24,10 +24,10 @@ WORTH_NATS = 9.0
 """A coarse cell this far below the best one is not looked at more closely."""
 
 OFFSETS_S = (-0.25, 0.0, 0.25)
-USUAL_SD_S, UNUSUAL_SD_S = 0.08, 0.3
-UNUSUAL_SHARE = 0.4
+USUAL_SD_S, UNUSUAL_SD_S = 0.08, 0.38
+UNUSUAL_SHARE = 0.6
 FINE_S = 0.07
-REACH_S = 0.49
+REACH_S = 0.56
 CELLS = 50
 """The time offset between camera and CSI: the best CELLS of the coarse grid at OFFSETS_S, each with half a
 step of tolerance, are asked again every FINE_S up to REACH_S; what they prefer is held."""
