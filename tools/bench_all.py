@@ -105,11 +105,14 @@ def _agent(text: str) -> Figures:
 
 def _bus(text: str) -> Figures:
     for row in json.loads(text)["rows"]:
-        figures = {key: value for key, value in row.items() if isinstance(value, float)}
-        p99 = next((value for key, value in figures.items() if key.startswith("p99")), None)
-        if p99 is not None:
-            name = next(value for value in row.values() if isinstance(value, str))
-            yield f"{name}, p99", f"{p99:.1f} ms", "", row.get("kept")
+        p99_ms, limit_ms = row["p99_ms"], row["limit_ms"]
+        kept = None if limit_ms is None else p99_ms <= limit_ms and not row["errors"]
+        yield (
+            f"{row['what']}, p99",
+            f"{p99_ms:.1f} ms",
+            "" if limit_ms is None else f"<= {limit_ms:g} ms",
+            kept,
+        )
 
 
 def _kill(text: str) -> Figures:
