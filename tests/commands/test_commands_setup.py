@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 
 from vad.commands import doctor
 from vad.commands.app import app
+from vad.commands.doctor.robot import check_serial_port
 from vad.config import NeatoRobot, RoombaRobot, ValetudoRobot, load_settings
 from vad.robot.map_server import save_floor_plan
 from vad.sim.home import floor_plan
@@ -164,7 +165,7 @@ def test_the_check_at_the_end_decides_what_comes_next(
     hub: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The doctor's own checks run on the new file; without a robot they find something."""
-    monkeypatch.setattr(doctor, "CHECKS", (doctor.check_serial_port,))
+    monkeypatch.setattr(doctor, "CHECKS", {"robot": (check_serial_port,)})
     config = tmp_path / "vad.yaml"
     arguments = ["setup", "--root", str(hub), "--config", str(config), "--yes"]
     result = CliRunner().invoke(app, arguments)

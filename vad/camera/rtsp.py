@@ -108,8 +108,6 @@ class RtspCamera:
 
 def open_rtsp(url: str, transport: Transport) -> Capture:
     """Open a stream with OpenCV's FFmpeg back-end; what it waits for is bounded."""
-    # OpenCV reads these at each opening; there is no other way to tell FFmpeg.
-    os.environ[_FFMPEG_OPTIONS] = f"rtsp_transport;{transport}|fflags;nobuffer"
     os.environ.setdefault(_FFMPEG_LOG_LEVEL, _FATAL_ONLY)
     limits = [
         cv2.CAP_PROP_OPEN_TIMEOUT_MSEC,
@@ -117,4 +115,13 @@ def open_rtsp(url: str, transport: Transport) -> Capture:
         cv2.CAP_PROP_READ_TIMEOUT_MSEC,
         _READ_TIMEOUT_MS,
     ]
-    return cv2.VideoCapture(url, cv2.CAP_FFMPEG, limits)
+    before = os.environ.get(_FFMPEG_OPTIONS)
+    # OpenCV reads this at each opening; there is no other way to tell FFmpeg. A video file must not find it.
+    os.environ[_FFMPEG_OPTIONS] = f"rtsp_transport;{transport}|fflags;nobuffer"
+    try:
+        return cv2.VideoCapture(url, cv2.CAP_FFMPEG, limits)
+    finally:
+        if before is None:
+            del os.environ[_FFMPEG_OPTIONS]
+        else:
+            os.environ[_FFMPEG_OPTIONS] = before

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any
@@ -54,9 +56,8 @@ def setup(
     Exit code 0: written, or shown with --dry-run; 1: nothing was written, or the check found something;
     2: the file cannot be written.
     """
-    logging.getLogger("vad").setLevel(logging.ERROR)  # what is wrong is said here, once
     silent = yes or as_json
-    with reported_errors():
+    with reported_errors(), _errors_only():
         if not dry_run:
             check_writable(config)
         before = _before(config)
@@ -84,7 +85,20 @@ def setup(
         sys.stdout.buffer.write(text.encode())  # the same bytes in every locale: this may go into a file
         return
     _tell(draft, config, backup)
-    _check_and_say_next(config, root, check=check)
+    with _errors_only():
+        _check_and_say_next(config, root, check=check)
+
+
+@contextmanager
+def _errors_only() -> Iterator[None]:
+    """What is wrong is said here, once; the parts that are tried need not say it, too."""
+    logger = logging.getLogger("vad")
+    before = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
 
 
 def _before(config: Path) -> dict[str, Any] | None:
