@@ -32,7 +32,6 @@ from vad.setup.surroundings import Surroundings, look_around
 from vad.setup.tables import found_table
 
 LAN_S = 1.5
-UNITS = ("etc/systemd/system/vad.service", "lib/systemd/system/vad.service")
 
 
 def setup(
@@ -86,7 +85,7 @@ def setup(
         return
     _tell(draft, config, backup)
     with _errors_only():
-        _check_and_say_next(config, root, check=check)
+        _check_and_say_next(config, check=check)
 
 
 @contextmanager
@@ -151,7 +150,7 @@ def _tell(draft: Draft, config: Path, backup: Path | None) -> None:
         out.print(f"! {sentence}", style="yellow", markup=False, highlight=False, soft_wrap=True)
 
 
-def _check_and_say_next(config: Path, root: Path, *, check: bool) -> None:
+def _check_and_say_next(config: Path, *, check: bool) -> None:
     well = True
     if check:
         out.print("\nTrying it (vad doctor) ...", highlight=False)
@@ -162,10 +161,8 @@ def _check_and_say_next(config: Path, root: Path, *, check: bool) -> None:
     named = "" if config == DEFAULT_CONFIG else f" --config {config}"
     if not well:
         following = f"mend what is marked above, then: vad doctor{named}"
-    elif config == DEFAULT_CONFIG and any((root / unit).exists() for unit in UNITS):
-        following = "sudo systemctl restart vad, then: vad status --watch"
     elif config == DEFAULT_CONFIG:
-        following = "sudo vad install (a service that starts at every boot), or try it first: vad run"
+        following = "sudo vad install (starts the service, confined to what these settings name); vad status"
     else:
         following = f"vad run{named}"
     out.print(f"\nNext: {following}", markup=False, highlight=False, soft_wrap=True)
