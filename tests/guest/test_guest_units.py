@@ -140,10 +140,13 @@ def test_the_watchdog_ends_what_hangs_and_systemd_starts_it_anew(report: dict[st
     assert re.fullmatch(r"active restarts [1-9]\d*", report["then"])
 
 
+# Not here: stopping. The pose network takes minutes for a picture under emulation, and a stop waits for the
+# picture that is looked at; tests/daemon/test_daemon_shutdown.py holds it to its time.
+
+
 def test_vad_install_narrows_it_to_its_settings(folder: Path, report: dict[str, str]) -> None:
     assert report["vad install"] == "0", (folder / "install.txt").read_text()
     assert sorted(report["allowed"].split()) == ["127.0.0.0/8", "::1/128"]
     assert "char-ttyUSB" not in report["devices"]
     assert "char-usb_device" not in report["devices"]
     assert "char-ttyACM rw" in report["devices"]
-    assert report["stopped"] == "success"
