@@ -322,7 +322,7 @@ class Registry:
         state, reason = verdict(
             self._settings.capture, self._plan, place, walks, posterior, was_mapped=was_mapped
         )
-        counts = {} if before is None else known.evidence
+        counts, now = {} if before is None else known.evidence, now_rfc3339()
         record = replace(
             known,
             state=state,
@@ -334,11 +334,11 @@ class Registry:
                 "walk_s": round(counts.get("walk_s", 0.0) + walk_s, 1),
             },
             estimate=self._estimate(place, total.height_range_m()),
-            updated_at=now_rfc3339(),
+            updated_at=now,
         )
-        stored = stored_terms(mac, self._plan.epoch, total, now_rfc3339())
+        stored = stored_terms(mac, self._plan.epoch, total, now)
         await self._keep(record, stored)
-        self._publish_heatmap(stored)
+        self._publish_heatmap(stored, posterior)
         if state == "mapped" and known.state != "mapped":
             where = f" in {record.estimate.room}" if record.estimate and record.estimate.room else ""
             self._event("mapped", mac, f"{known.name or mac} is mapped{where}, ±{place.radius90_m:.1f} m")
@@ -391,8 +391,9 @@ class Registry:
             device_message(record, device, in_network=here, source=self._settings.source)
         )
 
-    def _publish_heatmap(self, stored: PosteriorRecord) -> None:
-        p = self._joint(terms_of(stored)).probability
+    def _publish_heatmap(self, stored: PosteriorRecord, posterior: Posterior | None = None) -> None:
+        """posterior: what `stored` makes with the floor plan, where that is at hand."""
+        p = (posterior or self._joint(terms_of(stored))).probability
         self._bus.publish_heatmap(
             m.heatmap_message(
                 p,

@@ -72,9 +72,7 @@ def doppler_log_likelihood(
     `should_stop` asked to give up.
     """
     model = model or DopplerModel()
-    hop_s = np.median(np.diff(spectrogram.t_ns)) / 1e9 if len(spectrogram.t_ns) > 1 else 0.05
-    frames = np.arange(0, len(spectrogram.t_ns), max(1, round(model.frame_step_s / hop_s)))
-    frames = frames[walk.covers(spectrogram.t_ns[frames]) & (spectrogram.weight[frames] > 0)]
+    frames = asked_frames(spectrogram, walk, model.frame_step_s)
     if len(frames) == 0:
         return np.zeros(len(points_m))
     tables = [_tables(spectrogram, frames, width, model.signal_share) for width in model.kernels_hz]
@@ -94,6 +92,13 @@ def doppler_log_likelihood(
         )
         result[chunk] = _evidence(lines, tables, spectrogram.f_hz, model)
     return result
+
+
+def asked_frames(spectrogram: Spectrogram, walk: WalkTrack, step_s: float) -> NDArray[np.int64]:
+    """Every step_s a frame (K,), where the walk is known and packets cover it."""
+    hop_s = np.median(np.diff(spectrogram.t_ns)) / 1e9 if len(spectrogram.t_ns) > 1 else step_s
+    frames = np.arange(0, len(spectrogram.t_ns), max(1, round(step_s / hop_s)))
+    return frames[walk.covers(spectrogram.t_ns[frames]) & (spectrogram.weight[frames] > 0)]
 
 
 def log_heard(points_m: FloatArray, walk: WalkTrack) -> FloatArray:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vad.mapping.doppler_likelihood import asked_frames
 from vad.mapping.doppler_line import LineModel
 from vad.mapping.walk import WalkTrack
 from vad.sensing.spectrogram import Spectrogram
@@ -56,9 +57,7 @@ def loudness_log_likelihood(
     is unknown and summed over.
     """
     model = model or LoudnessModel()
-    hop_s = np.median(np.diff(spectra.t_ns)) / 1e9 if len(spectra.t_ns) > 1 else model.frame_s
-    frames = np.arange(0, len(spectra.t_ns), max(1, round(model.frame_s / hop_s)))
-    frames = frames[walk.covers(spectra.t_ns[frames]) & (spectra.weight[frames] > 0)]
+    frames = asked_frames(spectra, walk, model.frame_s)
     if len(frames) < MIN_FRAMES:
         return np.zeros(len(points_m))
     t_s = (spectra.t_ns[frames] - spectra.t_ns[frames[0]]) / 1e9
