@@ -12,10 +12,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from vad.geometry import floor_homography
 from vad.mac import normal_mac
-from vad.mapping.camera_calibration import PARAMETERS, CameraCalibration
 from vad.robot.map_server import save_floor_plan
+from vad.sim.calibration import true_calibration
 from vad.sim.driver import FifoSender, run
 from vad.sim.home import JPEG_QUALITY, floor_plan
 from vad.sim.hostapd import HostapdEmulator
@@ -23,7 +22,6 @@ from vad.sim.mjpeg import MjpegServer
 from vad.sim.neato import VirtualNeato
 from vad.sim.radio import Radio
 from vad.sim.render import Renderer
-from vad.sim.render_shapes import View
 from vad.sim.scenario import CARRIER_HZ, Scenario, make_home
 from vad.store.records import CameraRecord
 from vad.store.store import Store
@@ -174,26 +172,6 @@ def still_and_moving(scenario: Scenario, most: int | None = None) -> tuple[list[
     count = int((walk.end_s + AFTER_S - walk.start_s + BEFORE_S) * FPS)
     still = [_jpeg(renderer, rest_s + k / FPS) for k in range(STILL_PICTURES)[:most]]
     return still, [_jpeg(renderer, walk.start_s - BEFORE_S + k / FPS) for k in range(count)[:most]]
-
-
-def true_calibration(scenario: Scenario) -> CameraCalibration:
-    """What a perfect drive would tell of the camera, with centimetres of doubt."""
-    view = View.of(scenario.camera)
-    doubt = np.array([2e-3, 2e-3, 2e-3, 0.02, 0.02, 0.02, 5e-3, 1e-3, 1e-3, 1.0, 1.0])
-    assert len(doubt) == PARAMETERS
-    return CameraCalibration(
-        "valid",
-        100,
-        "",
-        pairs=60,
-        camera_from_map=view.camera_from_map,
-        intrinsics=view.intrinsics,
-        map_from_image=floor_homography(view.intrinsics, view.camera_from_map),
-        deviation_m=0.02,
-        time_offset_s=0.0,
-        time_offset_sigma_s=0.01,
-        parameter_covariance=np.diag(doubt**2),
-    )
 
 
 def _jpeg(renderer: Renderer, t_s: float) -> bytes:

@@ -33,7 +33,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
-from bench_idle_home import still_and_moving, true_calibration
+from bench_idle_home import still_and_moving
 from bench_week_sim import Simulation, Week, _Bus, settings_for
 from rich.console import Console
 from rich.table import Table
@@ -53,6 +53,7 @@ from vad.daemon.past import StoredPast
 from vad.devices.station import StationEvent
 from vad.health import Health
 from vad.robot.pose import RobotPose
+from vad.sim.calibration import true_calibration
 from vad.sim.household import DAY_S, HomeDevice, Household, Visit, hear, make_household
 from vad.store.store import Store
 from vad.streams import DropOldestQueue

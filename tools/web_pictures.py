@@ -15,19 +15,19 @@ from pathlib import Path
 from bench_web_browser import Browser
 from bench_week_sim import Simulation, settings_for
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "daemon"))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "web"))
 
-from daemon_world import true_calibration
-from web_world import plan_message, status, until
+from web_world import status, until
 
 from vad.bus import messages as m
 from vad.bus.grid import grid_to_png
 from vad.bus.node import Bus
+from vad.bus.plan import map_message
 from vad.bus.session import BusSettings
 from vad.daemon.registry import Registry
 from vad.daemon.wishes import Wishes
 from vad.mapping.camera_floor import floor_in_picture
+from vad.sim.calibration import true_calibration
 from vad.sim.household import DAY_S, Household, make_household
 from vad.store.worker import StoreWorker
 from vad.web.access import Access
@@ -66,7 +66,7 @@ async def show(house: Household, folder: Path, pictures: Path) -> None:
         await registry.load()
         for device in house.devices:
             await registry.joined(device.mac, device.name)
-        bus.publish_map(plan_message(house.plan))
+        bus.publish_map(map_message(house.plan, "simulated"))
         bus.publish_grid(grid_to_png(house.plan.cells))
         bus.publish_camera(camera(house))
         parts = (m.Part(part="robot", state="ok"),)

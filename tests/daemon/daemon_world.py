@@ -12,15 +12,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
-import numpy as np
 import yaml
 
 from vad.client import VadClient
 from vad.config import Settings, parse_settings
 from vad.errors import VadError
-from vad.geometry import floor_homography
-from vad.mapping.camera_calibration import PARAMETERS, CameraCalibration
-from vad.sim.render_shapes import View
+from vad.sim.calibration import true_calibration
 from vad.sim.scenario import Scenario
 from vad.store.records import CameraRecord
 from vad.store.store import Store
@@ -57,26 +54,6 @@ async def until(condition: Callable[[], bool], what: str, timeout_s: float = 10.
                 await asyncio.sleep(0.02)
     except TimeoutError:
         raise AssertionError(f"not in {timeout_s:.0f} s: {what}") from None
-
-
-def true_calibration(scenario: Scenario) -> CameraCalibration:
-    """What a perfect drive would tell of the scenario's camera, with centimetres of doubt."""
-    view = View.of(scenario.camera)
-    doubt = np.array([2e-3, 2e-3, 2e-3, 0.02, 0.02, 0.02, 5e-3, 1e-3, 1e-3, 1.0, 1.0])
-    assert len(doubt) == PARAMETERS
-    return CameraCalibration(
-        "valid",
-        100,
-        "",
-        pairs=60,
-        camera_from_map=view.camera_from_map,
-        intrinsics=view.intrinsics,
-        map_from_image=floor_homography(view.intrinsics, view.camera_from_map),
-        deviation_m=0.02,
-        time_offset_s=0.0,
-        time_offset_sigma_s=0.01,
-        parameter_covariance=np.diag(doubt**2),
-    )
 
 
 def store_calibration(state_dir: Path, scenario: Scenario) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from daemon_world import free_port, settings_for, true_calibration, until
+from daemon_world import free_port, settings_for, until
 
 from vad.agent.info import AgentInfo
 from vad.agent.node import Node
@@ -26,6 +26,7 @@ from vad.daemon.captures import Captures
 from vad.daemon.ears import Ears
 from vad.daemon.eyes import Eyes
 from vad.daemon.registry import Registry
+from vad.sim.calibration import true_calibration
 from vad.sim.driver import FifoSender, run
 from vad.sim.home import floor_plan
 from vad.sim.radio import Radio

@@ -11,13 +11,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from daemon_world import LONG_AGO, Vad, connect, free_port, true_calibration
+from daemon_world import LONG_AGO, Vad, connect, free_port
 
 from vad.bus.messages import CameraMessage
 from vad.client import VadClient
 from vad.geometry import project
 from vad.mapping.camera_calibration import CameraCalibration
 from vad.mapping.camera_view import CameraView
+from vad.sim.calibration import true_calibration
 from vad.sim.home import SimulatedHome
 from vad.sim.render import Renderer
 from vad.sim.render_shapes import View

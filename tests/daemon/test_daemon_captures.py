@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from daemon_world import true_calibration, until
+from daemon_world import until
 from test_daemon_parts import Hub, hub
 
 from vad.camera.folder import Recording
@@ -23,6 +23,7 @@ from vad.capture.session_writer import SessionWriter
 from vad.daemon.decisions import read
 from vad.mapping.evidence import Terms
 from vad.mapping.posterior import Grid
+from vad.sim.calibration import true_calibration
 from vad.sim.household import Household, Visit, hear, make_household
 from vad.sim.render import Renderer
 from vad.vision.people import PoseNetwork

@@ -39,7 +39,9 @@ async def test_a_home_in_home_assistant(tmp_path: Path) -> None:
             with Vad("run", "--config", settings, log=tmp_path / "daemon.log") as vad:
                 topics, mac = await _hub(vad, port)
                 await watcher.until(
-                    lambda: topics.device_config(mac) in watcher.payloads, "it is announced", 60
+                    lambda: {topics.device_config(mac), topics.device(mac)} <= watcher.payloads.keys(),
+                    "it is announced and told",
+                    60,
                 )
                 await watcher.until_says(topics.availability, b"online")
                 assert watcher.json(topics.device(mac))["in_zones"] == ["zone.home"]

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from daemon_world import free_port, settings_for, true_calibration, until
+from daemon_world import free_port, settings_for, until
 
 from vad.bus.node import Bus
 from vad.bus.session import BusSettings
@@ -29,6 +29,7 @@ from vad.daemon.eyes import Eyes
 from vad.daemon.registry import Registry
 from vad.mac import mac_to_text
 from vad.mapping.camera_calibration import CameraCalibration
+from vad.sim.calibration import true_calibration
 from vad.sim.home import floor_plan
 from vad.sim.radio import OTHER_MAC, Radio
 from vad.sim.render import Renderer

@@ -14,10 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from daemon_world import LONG_AGO, Vad, connect, free_port, store_calibration, true_calibration, wait_for
+from daemon_world import LONG_AGO, Vad, connect, free_port, store_calibration, wait_for
 from test_daemon_floor import home, turned
 
 from vad.robot.floor_plan import FREE, OCCUPIED, FloorPlan
+from vad.sim.calibration import true_calibration
 from vad.sim.scenario import make_home
 from vad.sim.valetudo import ValetudoServer
 from vad.store.records import DeviceRecord, Estimate

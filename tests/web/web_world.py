@@ -17,11 +17,11 @@ import numpy as np
 from vad.bus import messages as m
 from vad.bus.grid import grid_to_png
 from vad.bus.node import Bus
+from vad.bus.plan import map_message
 from vad.bus.session import BusSettings
 from vad.config import Settings, parse_settings
 from vad.daemon.registry import Registry
 from vad.daemon.wishes import Wishes
-from vad.robot.floor_plan import FloorPlan
 from vad.sim.home import floor_plan
 from vad.sim.scenario import make_home
 from vad.store.worker import StoreWorker
@@ -84,21 +84,6 @@ def device(i: int, turn: float = 0.0, **changes: Any) -> m.DeviceMessage:
     return m.DeviceMessage(**(fields | changes))
 
 
-def plan_message(plan: FloorPlan) -> m.MapMessage:
-    rows, columns = plan.cells.shape
-    rooms = tuple(m.Room(name=r.name, polygon_m=tuple(map(tuple, r.polygon.tolist()))) for r in plan.rooms)
-    return m.MapMessage(
-        source="simulated",
-        epoch=plan.epoch,
-        bounds_m=plan.bounds_m,
-        resolution_m=plan.resolution_m,
-        origin=plan.origin,
-        width=columns,
-        height=rows,
-        rooms=rooms,
-    )
-
-
 def heatmap(i: int) -> m.HeatmapMessage:
     x0, y0, x1, y1 = PLAN.bounds_m
     shape = round((y1 - y0) / 0.1), round((x1 - x0) / 0.1)
@@ -110,7 +95,7 @@ def heatmap(i: int) -> m.HeatmapMessage:
 
 def furnish(bus: Bus, devices: int) -> None:
     """Publish a home: its plan, a camera, devices in all states, a heatmap."""
-    bus.publish_map(plan_message(PLAN))
+    bus.publish_map(map_message(PLAN, "simulated"))
     bus.publish_grid(grid_to_png(PLAN.cells))
     x0, y0, x1, y1 = PLAN.bounds_m
     bus.publish_camera(

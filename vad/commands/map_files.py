@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from vad.bus.grid import png_to_grid
-from vad.bus.messages import MapMessage, Room
+from vad.bus.plan import map_message
 from vad.client import VadClient
 from vad.commands.console import (
     ANY_HUB,
@@ -94,24 +94,10 @@ def show(
         plan = read_plan(source)
         _describe(plan, source)
         if png is not None:
-            rows, columns = plan.cells.shape
-            outline = MapMessage(
-                source="replay",
-                epoch=plan.epoch,
-                bounds_m=plan.bounds_m,
-                resolution_m=plan.resolution_m,
-                origin=plan.origin,
-                width=columns,
-                height=rows,
-                rooms=tuple(
-                    Room(name=room.name, polygon_m=tuple((float(x), float(y)) for x, y in room.polygon))
-                    for room in plan.rooms
-                ),
-            )
             from vad.report.floor import Floor, save_floor  # matplotlib: the daemon must not load it
 
             try:
-                save_floor(Floor(outline, plan.cells, [], [], {}), png)
+                save_floor(Floor(map_message(plan, "replay"), plan.cells, [], [], {}), png)
             except OSError as error:
                 raise SourceError(f"cannot be written: {error.strerror}", where=str(png)) from error
             out.print(Text(f"wrote {png}"), soft_wrap=True)

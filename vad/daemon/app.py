@@ -18,6 +18,7 @@ from vad import __version__
 from vad.bus import messages as m
 from vad.bus.grid import grid_to_png
 from vad.bus.node import Bus, now_rfc3339
+from vad.bus.plan import map_message
 from vad.bus.session import BusSettings as NodeSettings
 from vad.bus.session import local_endpoints
 from vad.camera.frame import Frame
@@ -318,24 +319,8 @@ class Daemon:
             daemon.took("loop_lag", max(0.0, time.monotonic() - slept_s - STATUS_EVERY_S))
 
     def _publish_map(self) -> None:
-        plan = self._plan
-        rows, columns = plan.cells.shape
-        self._bus.publish_map(
-            m.MapMessage(
-                source=self._settings.source,
-                epoch=plan.epoch,
-                bounds_m=plan.bounds_m,
-                resolution_m=plan.resolution_m,
-                origin=plan.origin,
-                width=columns,
-                height=rows,
-                rooms=tuple(
-                    m.Room(name=room.name, polygon_m=tuple((float(x), float(y)) for x, y in room.polygon))
-                    for room in plan.rooms
-                ),
-            )
-        )
-        self._bus.publish_grid(grid_to_png(plan.cells))
+        self._bus.publish_map(map_message(self._plan, self._settings.source))
+        self._bus.publish_grid(grid_to_png(self._plan.cells))
 
     def _publish_camera(self, calibration: CameraCalibration) -> None:
         position, pose = calibration.position_m, calibration.camera_from_map
