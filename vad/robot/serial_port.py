@@ -254,5 +254,5 @@ def _reason(error: BaseException) -> str:
     if "device disconnected" in text:
         return "the line is gone. Was the adapter unplugged?"
     if "No such file" in text:
-        return f"{text}. Is the adapter plugged in? A path under /dev/serial/by-id stays the same"
+        return "no such port. Is the adapter plugged in? A path under /dev/serial/by-id stays the same"
     return text

@@ -125,7 +125,7 @@ def start() -> None:
 def stop() -> None:
     """The end of the service, and of the package."""
     with row("stopped") as found:
-        found["status command"] = sh("vad", "status", "--json")[:200]
+        found["status command"] = sh("vad", "status", "--json", check=False)[:200]
         begun_s = time.monotonic()
         sh("systemctl", "stop", "vad")
         found["stop_s"] = round(time.monotonic() - begun_s, 1)
@@ -161,6 +161,7 @@ def calibrate(home: Home) -> None:
                 until(lambda: (c := hub.camera()) and c.state == "valid", "a calibration", 15.0)
                 if drives % 2 == 1:
                     break
+            say(f"after {drives} drives: {(c := hub.camera()) and (c.state, c.reason, c.pairs)}")
             if drives > 5:
                 raise StuckError(f"no calibration after {drives} drives: {hub.camera()}")
         camera = hub.camera()
