@@ -1,9 +1,11 @@
-"""What all tests share: the recordings' place, and the rule that no test leaks a task or a thread."""
+"""What all tests share: the recordings, the Debian package; that no test leaks a task or a thread."""
 
 from __future__ import annotations
 
 import asyncio
 import os
+import shutil
+import subprocess
 import threading
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
@@ -21,7 +23,8 @@ os.environ["COLUMNS"] = "160"  # tables look alike in a terminal, in a pipe and 
 settings.register_profile("vad", deadline=None, derandomize="CI" in os.environ)
 settings.load_profile("vad")
 
-SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+ROOT = Path(__file__).resolve().parents[1]
+SHARED_DATA = ROOT.parent / "shared" / "data"
 
 
 @pytest.fixture(scope="session")
@@ -30,6 +33,20 @@ def shared_data() -> Path:
     if not SHARED_DATA.is_dir():
         pytest.skip(f"no recordings at {SHARED_DATA}")
     return SHARED_DATA
+
+
+@pytest.fixture(scope="session")
+def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The Debian package of this checkout; VAD_DEB names one that is built already."""
+    if given := os.environ.get("VAD_DEB"):
+        return Path(given)
+    if shutil.which("dpkg-deb") is None:
+        pytest.skip("no dpkg-deb: apt-get install dpkg")
+    folder = tmp_path_factory.mktemp("package")
+    build = [str(ROOT / "tools" / "deb" / "build"), "--out", str(folder)]
+    done = subprocess.run(build, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return Path(done.stdout.split()[-1])
 
 
 @pytest.fixture(autouse=True)

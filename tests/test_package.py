@@ -13,29 +13,12 @@ import pytest
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500)]
 
 ROOT = Path(__file__).resolve().parents[1]
-NEEDED = ("mmdebstrap", "dpkg-deb", "chroot", "mount")
+NEEDED = ("mmdebstrap", "chroot", "mount")
 DEPENDS = "python3.11,libstdc++6,zlib1g,libusb-1.0-0,systemd,udev"
 MOST_MB = 200
 """What a hub has to fetch."""
 IGNORED = ("var/log", "var/lib/dpkg", "var/cache", "proc", "run", "root", "tmp", "dev", "etc/.pwd.lock")
 USERS = ("etc/passwd-", "etc/group-", "etc/shadow-", "etc/gshadow-", "etc/subuid-", "etc/subgid-")
-
-
-@pytest.fixture(scope="module")
-def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The package of this checkout; VAD_DEB names one that is built already."""
-    missing = [tool for tool in NEEDED if shutil.which(tool) is None]
-    if missing:
-        pytest.skip(f"no {', '.join(missing)}: apt-get install mmdebstrap dpkg mount")
-    if os.geteuid() != 0:
-        pytest.skip("a root folder of Debian's needs root")
-    if given := os.environ.get("VAD_DEB"):
-        return Path(given)
-    folder = tmp_path_factory.mktemp("package")
-    build = [str(ROOT / "tools" / "deb" / "build"), "--out", str(folder)]
-    done = subprocess.run(build, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr[-3000:]
-    return Path(done.stdout.split()[-1])
 
 
 class Debian:
@@ -73,6 +56,10 @@ class Debian:
 @pytest.fixture(scope="module")
 def debian(package: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Debian]:
     """With what the package depends on."""
+    if missing := [tool for tool in NEEDED if shutil.which(tool) is None]:
+        pytest.skip(f"no {', '.join(missing)}: apt-get install mmdebstrap mount")
+    if os.geteuid() != 0:
+        pytest.skip("a root folder of Debian's needs root")
     assert package.is_file()
     root = tmp_path_factory.mktemp("debian") / "root"
     made = subprocess.run(

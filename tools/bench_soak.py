@@ -41,7 +41,7 @@ from rich.table import Table
 from vad.bus import messages as m
 from vad.bus.node import Bus
 from vad.bus.session import BusSettings
-from vad.camera.frame import Frame
+from vad.camera.frame import Frame, FrameQueue
 from vad.camera.http_stream import decode_jpeg
 from vad.capture.schedule import View
 from vad.client import VadClient
@@ -179,7 +179,7 @@ class Soak(Simulation):
             on_calibration=lambda _calibration: None,
         )
         self._ears = Ears()
-        self._frames: DropOldestQueue[Frame] = DropOldestQueue(2)
+        self._frames = FrameQueue(2)
         self._poses: DropOldestQueue[RobotPose] = DropOldestQueue(2048)
         self._batches: DropOldestQueue[CsiBatch] = DropOldestQueue(256)
         self._sample: CsiBatch | None = None

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from vad.camera.folder import FolderCamera, Recording
-from vad.camera.frame import Frame
+from vad.camera.frame import FrameQueue
 from vad.errors import SourceError
-from vad.streams import DropOldestQueue
 
 
 def picture(path: Path, value: int) -> None:
@@ -83,7 +82,7 @@ def test_no_recording(tmp_path: Path, make: str) -> None:
 async def test_playing_follows_the_times_and_ends(tmp_path: Path) -> None:
     recording = Recording(folder(tmp_path, ["1000000000,0.png", "1020000000,1.png", "1060000000,2.png"]))
     camera = FolderCamera(recording, speed=0.5)
-    out: DropOldestQueue[Frame] = DropOldestQueue(10)
+    out = FrameQueue(10)
     before = time.monotonic_ns()
     async with asyncio.timeout(5.0):
         await camera.run(out)
@@ -99,7 +98,7 @@ async def test_a_file_that_is_no_video_is_said(tmp_path: Path) -> None:
     path = tmp_path / "a.avi"
     path.write_bytes(b"no video")
     camera = FolderCamera(Recording(path))
-    await camera.run(DropOldestQueue(1))
+    await camera.run(FrameQueue(1))
     assert camera.health.state == "failed"
 
 

@@ -13,11 +13,10 @@ import cv2
 import numpy as np
 import pytest
 
-from vad.camera.frame import Frame
+from vad.camera.frame import Frame, FrameQueue
 from vad.camera.http_stream import HttpStreamCamera, decode_jpeg
 from vad.errors import ConfigError
 from vad.sim.mjpeg import MjpegServer, Style
-from vad.streams import DropOldestQueue
 
 
 def jpeg(value: int, width: int = 64, height: int = 48) -> bytes:
@@ -33,8 +32,8 @@ async def until(condition: Callable[[], bool], timeout_s: float = 5.0) -> None:
 
 
 @asynccontextmanager
-async def running(camera: HttpStreamCamera) -> AsyncIterator[DropOldestQueue[Frame]]:
-    out: DropOldestQueue[Frame] = DropOldestQueue(100)
+async def running(camera: HttpStreamCamera) -> AsyncIterator[FrameQueue]:
+    out = FrameQueue(100)
     task = asyncio.create_task(camera.run(out))
     try:
         yield out
@@ -43,7 +42,7 @@ async def running(camera: HttpStreamCamera) -> AsyncIterator[DropOldestQueue[Fra
         await asyncio.gather(task, return_exceptions=True)
 
 
-async def next_frame(out: DropOldestQueue[Frame]) -> Frame:
+async def next_frame(out: FrameQueue) -> Frame:
     async with asyncio.timeout(5.0):
         return await out.get()
 

@@ -17,10 +17,9 @@ from hypothesis import strategies as st
 from usb_world import Kinect, packet
 
 from vad.camera import kinect2
-from vad.camera.frame import Frame
+from vad.camera.frame import FrameQueue
 from vad.camera.kinect2_source import Kinect2Camera
 from vad.errors import ProtocolError
-from vad.streams import DropOldestQueue
 
 
 def jpeg(value: int, width: int = 96, height: int = 64) -> bytes:
@@ -131,8 +130,8 @@ async def until(condition: Callable[[], bool], timeout_s: float = 10.0) -> None:
 
 
 @asynccontextmanager
-async def running(camera: Kinect2Camera) -> AsyncIterator[DropOldestQueue[Frame]]:
-    out: DropOldestQueue[Frame] = DropOldestQueue(100)
+async def running(camera: Kinect2Camera) -> AsyncIterator[FrameQueue]:
+    out = FrameQueue(100)
     task = asyncio.create_task(camera.run(out))
     try:
         yield out

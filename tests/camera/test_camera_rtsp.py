@@ -15,10 +15,9 @@ import pytest
 from numpy.typing import NDArray
 from rtsp_world import RtspServer
 
-from vad.camera.frame import Frame
+from vad.camera.frame import FrameQueue
 from vad.camera.rtsp import RtspCamera, Transport
 from vad.errors import ConfigError
-from vad.streams import DropOldestQueue
 
 STRIPES = 8
 
@@ -43,8 +42,8 @@ async def until(condition: Callable[[], bool], timeout_s: float = 15.0) -> None:
 
 
 @asynccontextmanager
-async def running(camera: RtspCamera, depth: int = 500) -> AsyncIterator[DropOldestQueue[Frame]]:
-    out: DropOldestQueue[Frame] = DropOldestQueue(depth)
+async def running(camera: RtspCamera, depth: int = 500) -> AsyncIterator[FrameQueue]:
+    out = FrameQueue(depth)
     task = asyncio.create_task(camera.run(out))
     try:
         yield out
@@ -120,8 +119,11 @@ class Still:
     def isOpened(self) -> bool:  # noqa: N802
         return True
 
-    def read(self) -> tuple[bool, NDArray[np.uint8]]:
+    def grab(self) -> bool:
         self._tick.wait(0.005)
+        return True
+
+    def retrieve(self) -> tuple[bool, NDArray[np.uint8]]:
         return True, picture(1)
 
     def get(self, prop: int, /) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import threading
 import time
 from collections.abc import Callable
@@ -13,10 +14,9 @@ import cv2
 import numpy as np
 import pytest
 
-from vad.camera.frame import Frame
+from vad.camera.frame import FrameQueue
 from vad.camera.v4l2 import V4l2Camera, V4l2Settings, open_v4l2
 from vad.errors import SourceError
-from vad.streams import DropOldestQueue
 
 
 class Device:
@@ -28,6 +28,7 @@ class Device:
         self.plugged.set()
         self.settings: list[tuple[int, float]] = []
         self.open_handles = 0
+        self.decoded = 0
 
     def open(self, device: str) -> Handle:
         if not self.plugged.is_set():
@@ -44,10 +45,13 @@ class Handle:
     def isOpened(self) -> bool:  # noqa: N802
         return True
 
-    def read(self) -> tuple[bool, Any]:
+    def grab(self) -> bool:
         self.tick.wait(0.005)
-        good = self.device.plugged.is_set()
-        return good, np.full((48, 64, 3), 9, np.uint8) if good else None
+        return self.device.plugged.is_set()
+
+    def retrieve(self) -> tuple[bool, Any]:
+        self.device.decoded += 1
+        return True, np.full((48, 64, 3), 9, np.uint8)
 
     def get(self, prop: int, /) -> float:
         if prop == cv2.CAP_PROP_FOURCC:
@@ -76,7 +80,7 @@ async def until(condition: Callable[[], bool], timeout_s: float = 5.0) -> None:
 async def test_driver_stamps_unplug_and_replug() -> None:
     device = Device(lambda: monotonic_ms() - 30.0)
     camera = V4l2Camera(V4l2Settings("/dev/video9", 64, 48, 30.0), opener=device.open)
-    out: DropOldestQueue[Frame] = DropOldestQueue(1000)
+    out = FrameQueue(1000)
     task = asyncio.create_task(camera.run(out))
     await until(lambda: len(out) >= 3)
     frame = out.drain()[-1]
@@ -104,7 +108,7 @@ async def test_driver_stamps_unplug_and_replug() -> None:
 async def test_stamps_of_another_clock_are_replaced_by_the_arrival(stamp_ms: float) -> None:
     device = Device(lambda: stamp_ms if stamp_ms != 12345.0 else monotonic_ms() - 60_000.0)
     camera = V4l2Camera(V4l2Settings("/dev/video9"), opener=device.open)
-    out: DropOldestQueue[Frame] = DropOldestQueue(10)
+    out = FrameQueue(10)
     task = asyncio.create_task(camera.run(out))
     async with asyncio.timeout(5.0):
         frame = await out.get()
@@ -127,7 +131,7 @@ async def test_a_trusted_driver_is_believed_when_its_pictures_come_late() -> Non
 
     device = Device(stamp_ms)
     camera = V4l2Camera(V4l2Settings("/dev/video9"), opener=device.open)
-    out: DropOldestQueue[Frame] = DropOldestQueue(1000)
+    out = FrameQueue(1000)
     task = asyncio.create_task(camera.run(out))
     await until(lambda: time.monotonic_ns() - out.drain()[-1].t_ns > 2_200_000_000 if len(out) else False)
     assert camera.health.counters["arrival_stamps"] == 0
@@ -136,9 +140,24 @@ async def test_a_trusted_driver_is_believed_when_its_pictures_come_late() -> Non
     await asyncio.gather(task, return_exceptions=True)
 
 
+async def test_only_what_is_wanted_is_decoded() -> None:
+    device = Device(monotonic_ms)
+    out = FrameQueue(1000)
+    out.step_ns = 50_000_000
+    task = asyncio.create_task(V4l2Camera(V4l2Settings("/dev/video9"), opener=device.open).run(out))
+    await until(lambda: len(out) >= 6)
+    times = [frame.t_ns for frame in out.drain()]
+    assert min(b - a for a, b in itertools.pairwise(times)) >= out.step_ns
+    assert device.decoded <= len(times) + 1
+    out.step_ns = 0
+    await until(lambda: len(out) >= 6)
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+
+
 async def test_absent_device_is_trouble_not_the_end(tmp_path: Path) -> None:
     camera = V4l2Camera(V4l2Settings(str(tmp_path / "video0")))
-    task = asyncio.create_task(camera.run(DropOldestQueue(1)))
+    task = asyncio.create_task(camera.run(FrameQueue(1)))
     await until(lambda: camera.health.state == "degraded")
     assert "no such camera" in camera.health.detail
     task.cancel()

@@ -18,7 +18,7 @@ from vad.agent.info import AgentInfo
 from vad.agent.node import Node
 from vad.bus.node import Bus
 from vad.bus.session import BusSettings
-from vad.camera.frame import Frame
+from vad.camera.frame import Frame, FrameQueue
 from vad.capture.session import load_session
 from vad.csi.follow import FollowLog
 from vad.daemon.agents import Agents
@@ -33,7 +33,6 @@ from vad.sim.radio import Radio
 from vad.sim.render import Renderer
 from vad.sim.scenario import make_home
 from vad.store.worker import StoreWorker
-from vad.streams import DropOldestQueue
 from vad.vision.people import PoseNetwork
 
 HOME = make_home(1)
@@ -56,7 +55,7 @@ async def meanwhile(*works: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
                 await task
 
 
-async def film(frames: DropOldestQueue[Frame], renderer: Renderer, start_ns: int) -> None:
+async def film(frames: FrameQueue, renderer: Renderer, start_ns: int) -> None:
     """What the camera sees, ten times a second."""
     number = 0
     while True:
@@ -86,7 +85,7 @@ async def test_a_walk_past_a_remote_card_places_it(tmp_path: Path) -> None:
         registry, agents = Registry(settings, plan, bus, store), Agents(bus.keys)
         await registry.load()
         captures = Captures(settings, tmp_path, plan, eyes, Ears(), registry, bus, agents)
-        frames: DropOldestQueue[Frame] = DropOldestQueue(2)
+        frames = FrameQueue(2)
         sender = FifoSender(tmp_path / "csi.fifo")
         node = Node(
             BusSettings(mode="client", listen=(), connect=(endpoint,)),

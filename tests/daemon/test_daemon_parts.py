@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 from daemon_world import free_port, settings_for, until
+from numpy.typing import NDArray
 
 from vad.bus.node import Bus
 from vad.bus.session import BusSettings
-from vad.camera.frame import Frame
+from vad.camera.frame import Frame, FrameQueue
 from vad.capture.session import SCHEMA, SessionAnchor, SessionDevice, SessionHeader, load_session
 from vad.capture.session_writer import SessionWriter
 from vad.csi.attribution import Attribution
@@ -166,7 +167,7 @@ class Hub:
     captures: Captures
     registry: Registry
     eyes: Eyes
-    frames: DropOldestQueue[Frame]
+    frames: FrameQueue
     batches: DropOldestQueue[CsiBatch]
     running: asyncio.Task[None]
 
@@ -191,7 +192,7 @@ async def hub(
         registry = Registry(settings, plan, bus, store)
         await registry.load()
         captures = Captures(settings, folder, plan, eyes, ears, registry, bus)
-        frames: DropOldestQueue[Frame] = DropOldestQueue(2)
+        frames = FrameQueue(2)
         batches: DropOldestQueue[CsiBatch] = DropOldestQueue(256)
         seeing = asyncio.create_task(eyes.run(frames))
         running = asyncio.create_task(captures.run())
@@ -237,6 +238,24 @@ async def test_what_is_missing_is_told_one_after_the_other(tmp_path: Path, netwo
         assert world.captures.step == walker
         await until(lambda: world.registry.get(LAMP).reason != walker, "it is silent again")
     assert not (tmp_path / "sessions").exists()
+
+
+async def test_an_empty_room_is_looked_at_half_as_often(tmp_path: Path, network: PoseNetwork) -> None:
+    renderer = Renderer(HOME)
+    still = renderer.frame(WALK.start_s - 5.0)
+    async with hub(tmp_path, network, true_calibration(HOME)) as world:
+        await until(lambda: world.frames.step_ns > 0, "it says how often")
+        moving_ns = world.frames.step_ns
+
+        async def shown(image: NDArray[np.uint8], numbers: range) -> int:
+            for number in numbers:
+                world.frames.put(Frame(number * S // 15, number, image))
+                await until(lambda: world.eyes.frames == number + 1, "the picture is looked at")  # noqa: B023
+            return world.frames.step_ns
+
+        still_ns = await shown(still, range(40))
+        assert still_ns > 1.2 * moving_ns
+        assert await shown(renderer.frame(WALK.start_s + 3.0), range(40, 43)) == moving_ns
 
 
 async def play(world: Hub, renderer: Renderer, from_s: float) -> None:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+import resource
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
 
 import pytest
@@ -31,8 +32,16 @@ PLAN = floor_plan(make_home(1))
 class Home:
     """A hub with a lamp and a TV; the settings name the TV and ignore the phone."""
 
-    def __init__(self, endpoint: str) -> None:
+    def __init__(self, endpoint: str, wishes: asyncio.Task[None] | None = None) -> None:
         self._endpoint = endpoint
+        self._wishes = wishes
+
+    async def end(self) -> None:
+        """Grant no more wishes, as a daemon that stops."""
+        if self._wishes is not None:
+            self._wishes.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await self._wishes
 
     async def vad_device(self, *arguments: str, code: int = 0) -> str:
         """What the command says."""
@@ -74,13 +83,12 @@ async def home(folder: Path) -> AsyncIterator[Home]:
         await registry.load()
         for mac, name in ((LAMP, "ESP_1234"), (TV, None), (PHONE, "phone")):
             await registry.joined(mac, name)
-        wishes = asyncio.create_task(Wishes(bus.keys, registry, "simulated").run(bus.session))
+        wish = Wishes(bus.keys, registry, "simulated", patience_s=1.0)
+        there = Home(endpoint, asyncio.create_task(wish.run(bus.session)))
         try:
-            yield Home(endpoint)
+            yield there
         finally:
-            wishes.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await wishes
+            await there.end()
 
 
 async def test_a_device_is_ignored_and_shown_again(tmp_path: Path) -> None:
@@ -109,6 +117,36 @@ async def test_a_device_is_renamed_and_forgotten(tmp_path: Path) -> None:
         assert await there.devices() == {TV: "the big one"}
         assert "no device with the address" in await there.vad_device("forget", LAMP, code=2)
         assert "not a MAC address" in await there.vad_device("forget", "lamp", code=2)
+
+
+@contextmanager
+def disk_full(folder: Path) -> Iterator[None]:
+    """The database grows no more: what a disk does that has no room left."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, ((folder / "vad.sqlite-wal").stat().st_size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+async def test_what_cannot_be_kept_now_waits_and_says_so(tmp_path: Path) -> None:
+    async with home(tmp_path) as there:
+        with disk_full(tmp_path):
+            assert "waits to be kept" in await there.vad_device("rename", LAMP, "lamp", code=2)
+            assert (await there.devices())[LAMP] == "ESP_1234"
+        async with asyncio.timeout(20.0):
+            while (await there.devices())[LAMP] != "lamp":  # noqa: ASYNC110 - asked as a client asks
+                await asyncio.sleep(0.05)
+
+
+async def test_a_wish_that_waits_does_not_keep_the_daemon(tmp_path: Path) -> None:
+    async with home(tmp_path) as there:
+        with disk_full(tmp_path):
+            assert "waits to be kept" in await there.vad_device("rename", LAMP, "lamp", code=2)
+            await there.end()
+    async with home(tmp_path) as there:
+        assert (await there.devices())[LAMP] == "ESP_1234"
 
 
 async def test_what_is_no_wish_is_refused(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -12,31 +11,22 @@ from typing import Any
 
 import numpy as np
 import pytest
+from guest_world import Guest
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 
-ROOT = Path(__file__).resolve().parents[2]
-NEEDED = ("qemu-system-x86_64", "mmdebstrap", "mksquashfs", "busybox", "modprobe", "cpio", "zstd")
-PACKAGES = "qemu-system-x86 mmdebstrap squashfs-tools busybox-static kmod cpio zstd"
 FRAMES = 12
 
 
 @pytest.fixture(scope="module")
-def report(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+def report(guest: Guest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """What vad's adapters saw in the guest."""
-    missing = [tool for tool in NEEDED if shutil.which(tool) is None]
-    if missing:
-        pytest.skip(f"no {', '.join(missing)}: apt-get install {PACKAGES}")
-    if os.geteuid() != 0:
-        pytest.skip("building the guest needs root")
     folder = tmp_path_factory.mktemp("cameras")
     for file in (Path(__file__).parent / "cameras").iterdir():
         if file.is_file():
             shutil.copy(file, folder)
     subprocess.run([sys.executable, str(folder / "pictures.py"), str(folder)], check=True)
-    command = [str(ROOT / "tools" / "guest" / "run"), str(folder)]
-    limit = {**os.environ, "VAD_GUEST_TIMEOUT_S": "1200"}
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=limit)
+    done = guest(folder, timeout_s=1200)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     found: dict[str, Any] = json.loads((folder / "report.json").read_text())
     return found

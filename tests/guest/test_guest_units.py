@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
 import subprocess
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from guest_world import Guest
 
 from vad.robot.map_server import save_floor_plan
 from vad.sim.home import floor_plan
@@ -19,26 +19,15 @@ from vad.sim.scenario import make_home
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3000)]
 
 ROOT = Path(__file__).resolve().parents[2]
-NEEDED = ("qemu-system-x86_64", "mmdebstrap", "mksquashfs", "busybox", "modprobe", "cpio", "zstd", "dpkg-deb")
-PACKAGES = "qemu-system-x86 mmdebstrap squashfs-tools busybox-static kmod cpio zstd"
 CAP_NET_ADMIN = 1 << 12
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the guest left: report.txt, status.json, journal.txt. VAD_DEB names a package built already."""
-    missing = [tool for tool in NEEDED if shutil.which(tool) is None]
-    if missing:
-        pytest.skip(f"no {', '.join(missing)}: apt-get install {PACKAGES}")
-    if os.geteuid() != 0:
-        pytest.skip("building the guest needs root")
+def folder(guest: Guest, package: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the guest left: report.txt, status.json, journal.txt."""
     base = tmp_path_factory.mktemp("units")
     folder, tree, content = base / "shared", base / "tree", base / "content.sqfs"
     folder.mkdir()
-    package = os.environ.get("VAD_DEB")
-    if package is None:
-        build = [str(ROOT / "tools" / "deb" / "build"), "--out", str(base)]
-        package = subprocess.run(build, capture_output=True, text=True, check=True).stdout.split()[-1]
     subprocess.run(["dpkg-deb", "--extract", package, tree], check=True)
     subprocess.run(
         ["mksquashfs", tree, content, "-comp", "zstd", "-Xcompression-level", "2", "-quiet", "-no-progress",
@@ -51,13 +40,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copy(ROOT / "config" / "vad.yaml", folder)
     save_floor_plan(floor_plan(make_home(1)), folder / "floor.yaml")
     drive = f"file={content},format=raw,if=virtio,readonly=on"
-    done = subprocess.run(
-        [str(ROOT / "tools" / "guest" / "run"), str(folder), "-drive", drive],
-        env=os.environ | {"VAD_GUEST_TIMEOUT_S": "2400"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = guest(folder, "-drive", drive, timeout_s=2400)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     return folder
 
@@ -140,8 +123,8 @@ def test_the_watchdog_ends_what_hangs_and_systemd_starts_it_anew(report: dict[st
     assert re.fullmatch(r"active restarts [1-9]\d*", report["then"])
 
 
-# Not here: stopping. The pose network takes minutes for a picture under emulation, and a stop waits for the
-# picture that is looked at; tests/daemon/test_daemon_shutdown.py holds it to its time.
+# Not here: stopping, which waits for the pose network's picture, under emulation 11 s; tests/guest/test_guest_hub.py
+# stops a daemon with a quicker network.
 
 
 def test_vad_install_narrows_it_to_its_settings(folder: Path, report: dict[str, str]) -> None:

@@ -3,38 +3,27 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import subprocess
 from pathlib import Path
 from typing import Any
 
 import pytest
+from guest_world import Guest
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500)]
 
-ROOT = Path(__file__).resolve().parents[2]
-NEEDED = ("qemu-system-x86_64", "mmdebstrap", "mksquashfs", "busybox", "modprobe", "cpio", "zstd")
-PACKAGES = "qemu-system-x86 mmdebstrap squashfs-tools busybox-static kmod cpio zstd"
 SOON_S = 2.0
 """A guest's Python is some ten times slower than a hub's."""
 
 
 @pytest.fixture(scope="module")
-def report(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+def report(guest: Guest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """What vad's join sources heard in the guest."""
-    missing = [tool for tool in NEEDED if shutil.which(tool) is None]
-    if missing:
-        pytest.skip(f"no {', '.join(missing)}: apt-get install {PACKAGES}")
-    if os.geteuid() != 0:
-        pytest.skip("building the guest needs root")
     folder = tmp_path_factory.mktemp("wifi")
     for file in (Path(__file__).parent / "wifi").iterdir():
         if file.is_file():
             shutil.copy(file, folder)
-    done = subprocess.run(
-        [str(ROOT / "tools" / "guest" / "run"), str(folder)], capture_output=True, text=True, check=False
-    )
+    done = guest(folder)
     logs = "".join(log.read_text()[-2000:] for log in sorted(folder.glob("*.log")))
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:] + logs
     found: dict[str, Any] = json.loads((folder / "report.json").read_text())

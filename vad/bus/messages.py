@@ -299,8 +299,8 @@ class ErrorMessage(msgspec.Struct, frozen=True, kw_only=True):
     """Why a query is refused: a code for programs, a sentence for people.
 
     Codes now: bad_selector; bad_wish; out_of_history (asked for a time before what is kept); not_available
-    (this daemon keeps no history); busy (ask again later); internal. A reader takes one it does not know for
-    a refusal.
+    (this daemon keeps no history); busy (ask again later); waiting (it is done once it can be); internal. A
+    reader takes one it does not know for a refusal.
     """
 
     schema: Literal["vad.error.v1"] = "vad.error.v1"

@@ -15,10 +15,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from vad.camera.frame import Frame
+from vad.camera.frame import Frame, FrameQueue
 from vad.errors import SourceError
 from vad.health import Health
-from vad.streams import DropOldestQueue
 
 log = logging.getLogger(__name__)
 
@@ -127,7 +126,7 @@ class FolderCamera:
         self._recording = recording
         self._speed = speed
 
-    async def run(self, out: DropOldestQueue[Frame]) -> None:
+    async def run(self, out: FrameQueue) -> None:
         """Emit frames into `out` until the recording ends or this is cancelled."""
         loop = asyncio.get_running_loop()
         frames = self._recording.frames()
@@ -145,6 +144,8 @@ class FolderCamera:
                 wait_s = 1e-9 * (due_ns - time.monotonic_ns())
                 if wait_s > _SOON_S:
                     await asyncio.sleep(wait_s)
+                if not out.wants(due_ns):
+                    continue
                 out.put(Frame(due_ns, frame.seq, frame.image))
                 self.health.counters["frames"] += 1
                 self.health.ok("playing a recording")

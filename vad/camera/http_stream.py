@@ -12,7 +12,7 @@ from urllib.parse import unquote, urlsplit
 import cv2
 import numpy as np
 
-from vad.camera.frame import Frame
+from vad.camera.frame import Frame, FrameQueue
 from vad.camera.mjpeg import (
     MAX_HEAD_BYTES,
     ChunkedDecoder,
@@ -63,7 +63,7 @@ class HttpStreamCamera:
         self.health = Health(part)
         self._seq = 0
 
-    async def run(self, out: DropOldestQueue[Frame]) -> None:
+    async def run(self, out: FrameQueue) -> None:
         """Emit frames into `out` until cancelled."""
         backoff_s = BACKOFF_FIRST_S
         while True:
@@ -80,7 +80,7 @@ class HttpStreamCamera:
             await asyncio.sleep(backoff_s)
             backoff_s = min(2.0 * backoff_s, BACKOFF_MAX_S)
 
-    async def _stream(self, out: DropOldestQueue[Frame]) -> None:
+    async def _stream(self, out: FrameQueue) -> None:
         async with asyncio.timeout(CONNECT_TIMEOUT_S):
             # A picture fits: the connection is not stopped and started again for each.
             reader, writer = await asyncio.open_connection(self._host, self._port, limit=_READ_BYTES)
@@ -141,11 +141,13 @@ class HttpStreamCamera:
         pool: Executor,
         waiting: DropOldestQueue[Undecoded],
         clock: StreamClock,
-        out: DropOldestQueue[Frame],
+        out: FrameQueue,
     ) -> None:
         loop = asyncio.get_running_loop()
         while True:
             t_ns, jpeg = await waiting.get()
+            if not out.wants(t_ns):
+                continue
             image = await loop.run_in_executor(pool, decode_jpeg, jpeg)
             if image is None:
                 self.health.counters["bad_pictures"] += 1

@@ -16,12 +16,11 @@ import usb.util
 from numpy.typing import NDArray
 
 from vad.camera import kinect2
-from vad.camera.frame import Frame
-from vad.camera.threaded import Emit, Shot, run_reopening
+from vad.camera.frame import FrameQueue
+from vad.camera.threaded import Emit, Shot, Wants, run_reopening
 from vad.clock import ClockMap
 from vad.errors import SourceError
 from vad.health import Health
-from vad.streams import DropOldestQueue
 
 _TRANSFER_BYTES = 1 << 20
 # A blocked read holds up the end of the daemon by this; 30 pictures a second come, 15 in the dark.
@@ -68,21 +67,21 @@ class Kinect2Camera:
         self._step_ns = int(0.75e9 / fps)
         self._backend = backend
 
-    async def run(self, out: DropOldestQueue[Frame]) -> None:
+    async def run(self, out: FrameQueue) -> None:
         """Emit frames into `out` until cancelled."""
         await run_reopening(self._session, out, self.health, name="kinect2", end_s=_END_S)
 
-    def _session(self, stop: threading.Event, emit: Emit) -> None:
+    def _session(self, stop: threading.Event, emit: Emit, wants: Wants) -> None:
         device = self._find()
         try:
             with _said(), _Link(device) as link, _Decoder(self._flag, emit) as decoder:
                 link.start(stop)
-                self._read(link, decoder, stop)
+                self._read(link, decoder, stop, wants)
         finally:
             with contextlib.suppress(usb.core.USBError):
                 usb.util.dispose_resources(device)
 
-    def _read(self, link: _Link, decoder: _Decoder, stop: threading.Event) -> None:
+    def _read(self, link: _Link, decoder: _Decoder, stop: threading.Event, wants: Wants) -> None:
         assembler, clock = kinect2.PictureAssembler(), ClockMap()
         last_ns, silent, broken = 0, 0, 0
         while not stop.is_set():
@@ -99,7 +98,7 @@ class Kinect2Camera:
             counter = np.array([picture.ticks * kinect2.TICK_US & 0xFFFFFFFF], np.uint32)
             t_ns = int(clock.update(counter, np.array([arrival_ns], np.int64))[0])
             decoder.count("received", 1)
-            if t_ns - last_ns >= self._step_ns:
+            if t_ns - last_ns >= self._step_ns and wants(min(t_ns, arrival_ns)):
                 last_ns = t_ns
                 decoder.put(min(t_ns, arrival_ns), picture.jpeg)
 

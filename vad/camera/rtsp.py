@@ -12,12 +12,11 @@ from urllib.parse import urlsplit
 import cv2
 import numpy as np
 
-from vad.camera.frame import Frame
-from vad.camera.threaded import Emit, Shot, run_reopening
+from vad.camera.frame import FrameQueue
+from vad.camera.threaded import Emit, Shot, Wants, run_reopening
 from vad.clock import ClockMap
 from vad.errors import ConfigError, SourceError
 from vad.health import Health
-from vad.streams import DropOldestQueue
 
 Transport = Literal["tcp", "udp"]
 
@@ -34,7 +33,8 @@ class Capture(Protocol):
     """What is used of cv2.VideoCapture."""
 
     def isOpened(self) -> bool: ...  # noqa: N802
-    def read(self) -> tuple[bool, Any]: ...
+    def grab(self) -> bool: ...
+    def retrieve(self) -> tuple[bool, Any]: ...
     def get(self, prop: int, /) -> float: ...
     def release(self) -> None: ...
 
@@ -77,11 +77,11 @@ class RtspCamera:
         self._transport = transport
         self._opener = opener or open_rtsp
 
-    async def run(self, out: DropOldestQueue[Frame]) -> None:
+    async def run(self, out: FrameQueue) -> None:
         """Emit frames into `out` until cancelled."""
         await run_reopening(self._session, out, self.health, name=f"rtsp {self._where}", end_s=_END_S)
 
-    def _session(self, stop: threading.Event, emit: Emit) -> None:
+    def _session(self, stop: threading.Event, emit: Emit, wants: Wants) -> None:
         capture = self._opener(self._url, self._transport)
         clock, restarts = ClockMap(), 0
         try:
@@ -89,19 +89,25 @@ class RtspCamera:
                 remedy = "see whether it is on, and whether the path, user and password are right"
                 raise SourceError("the camera cannot be opened", where=self._where, remedy=remedy)
             while not stop.is_set():
-                good, image = capture.read()
+                good = capture.grab()
                 arrival_ns = time.monotonic_ns()
-                if not good or image is None:
+                if not good:
                     raise SourceError("the camera has stopped sending", where=self._where)
                 since_start_us = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e3)
                 counter = np.array([since_start_us & 0xFFFFFFFF], np.uint32)
                 t_ns = int(clock.update(counter, np.array([arrival_ns], np.int64))[0])
+                t_ns = min(t_ns, arrival_ns)
+                if not wants(t_ns):
+                    continue
+                good, image = capture.retrieve()
+                if not good or image is None:
+                    raise SourceError("the camera has stopped sending", where=self._where)
                 picture = np.asarray(image, dtype=np.uint8)
                 height, width = picture.shape[:2]
                 stamps = "arrival" if clock.still else "stream"
                 counts = {"arrival_stamps": int(clock.still), "clock_restarts": clock.restarts - restarts}
                 restarts = clock.restarts
-                emit(Shot(min(t_ns, arrival_ns), picture, f"{width}x{height}, stamps: {stamps}", counts))
+                emit(Shot(t_ns, picture, f"{width}x{height}, stamps: {stamps}", counts))
         finally:
             capture.release()
 

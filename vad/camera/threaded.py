@@ -13,10 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vad.camera.frame import Frame
+from vad.camera.frame import Frame, FrameQueue
 from vad.errors import ProtocolError, SourceError
 from vad.health import Health
-from vad.streams import DropOldestQueue
 
 log = logging.getLogger(__name__)
 
@@ -35,13 +34,14 @@ class Shot:
 
 
 Emit = Callable[[Shot], None]
-Session = Callable[[threading.Event, Emit], None]
-"""Opens the camera, emits until the event is set, closes it. Raises SourceError, ProtocolError or cv2.error
-when the camera is not there or has gone; emitting never blocks."""
+Wants = Callable[[int], bool]
+Session = Callable[[threading.Event, Emit, Wants], None]
+"""Opens the camera, emits the pictures whose times are wanted until the event is set, closes it. Raises
+SourceError, ProtocolError or cv2.error when the camera is not there or has gone; emitting never blocks."""
 
 
 async def run_reopening(
-    session: Session, out: DropOldestQueue[Frame], health: Health, *, name: str, end_s: float
+    session: Session, out: FrameQueue, health: Health, *, name: str, end_s: float
 ) -> None:
     """Run sessions one after the other in a thread until cancelled.
 
@@ -73,7 +73,7 @@ async def run_reopening(
         # A RuntimeError: the loop has gone, and nobody waits any more.
         with contextlib.suppress(RuntimeError):
             try:
-                _repeat(session, stop, loop, take, trouble)
+                _repeat(session, out.wants, stop, loop, take, trouble)
             finally:
                 loop.call_soon_threadsafe(ended.set)
 
@@ -91,6 +91,7 @@ async def run_reopening(
 
 def _repeat(
     session: Session,
+    wants: Wants,
     stop: threading.Event,
     loop: asyncio.AbstractEventLoop,
     take: Callable[[Shot], None],
@@ -106,7 +107,7 @@ def _repeat(
             loop.call_soon_threadsafe(take, shot)
 
         try:
-            session(stop, emit)
+            session(stop, emit, wants)
         except (SourceError, ProtocolError, cv2.error) as error:
             if not stop.is_set():
                 loop.call_soon_threadsafe(trouble, str(error))

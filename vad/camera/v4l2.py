@@ -13,12 +13,11 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
-from vad.camera.frame import Frame
+from vad.camera.frame import FrameQueue
 from vad.camera.stamps import is_plausible
-from vad.camera.threaded import Emit, Shot, run_reopening
+from vad.camera.threaded import Emit, Shot, Wants, run_reopening
 from vad.errors import SourceError
 from vad.health import Health
-from vad.streams import DropOldestQueue
 
 # The thread ends within one frame or this; OpenCV's own 10 s would hold up the end of the daemon.
 _SELECT_TIMEOUT_S = 1
@@ -31,7 +30,8 @@ class Capture(Protocol):
     """What is used of cv2.VideoCapture."""
 
     def isOpened(self) -> bool: ...  # noqa: N802
-    def read(self) -> tuple[bool, Any]: ...
+    def grab(self) -> bool: ...
+    def retrieve(self) -> tuple[bool, Any]: ...
     def get(self, prop: int, /) -> float: ...
     def set(self, prop: int, value: float, /) -> bool: ...
     def release(self) -> None: ...
@@ -73,12 +73,12 @@ class V4l2Camera:
         self._settings = settings
         self._opener = opener or open_v4l2
 
-    async def run(self, out: DropOldestQueue[Frame]) -> None:
+    async def run(self, out: FrameQueue) -> None:
         """Emit frames into `out` until cancelled."""
         name = f"v4l2 {self._settings.device}"
         await run_reopening(self._capture, out, self.health, name=name, end_s=_SELECT_TIMEOUT_S)
 
-    def _capture(self, stop: threading.Event, emit: Emit) -> None:
+    def _capture(self, stop: threading.Event, emit: Emit, wants: Wants) -> None:
         """Read frames until told to stop; a SourceError when the device is not there or has gone."""
         wanted = self._settings
         capture = self._opener(wanted.device)
@@ -93,15 +93,20 @@ class V4l2Camera:
             capture.set(cv2.CAP_PROP_FPS, wanted.fps)
             fourcc, stamps, last_ns = _format(capture), _DriverClock(), 0
             while not stop.is_set():
-                good, image = capture.read()
+                good = capture.grab()
                 arrival_ns = time.monotonic_ns()
-                if not good or image is None:
+                if not good:
                     raise SourceError("the camera has stopped sending", where=wanted.device)
                 driver_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
                 t_ns, trusted = stamps.stamp(driver_ns, arrival_ns)
                 if t_ns <= last_ns:  # the clocks were mixed for a moment; time does not go back
                     continue
                 last_ns = t_ns
+                if not wants(t_ns):
+                    continue
+                good, image = capture.retrieve()
+                if not good or image is None:
+                    raise SourceError("the camera has stopped sending", where=wanted.device)
                 picture = np.asarray(image, dtype=np.uint8)
                 height, width = picture.shape[:2]
                 detail = f"{width}x{height} {fourcc}, stamps: {'driver' if trusted else 'arrival'}"

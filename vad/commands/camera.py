@@ -180,7 +180,7 @@ async def _watch(
     quiet: bool,
     known: bool,
 ) -> None:
-    from vad.camera.frame import Frame
+    from vad.camera.frame import FrameQueue
     from vad.camera.lens_file import camera_lens
     from vad.daemon.adapters import camera_source, robot_finder
     from vad.daemon.eyes import Eyes
@@ -200,7 +200,7 @@ async def _watch(
     if settings.map.file is not None:
         of_file = load_floor_plan(resolve(settings.map.file, config_file), epoch=settings.map.epoch)
     poses: DropOldestQueue[RobotPose] = DropOldestQueue(256)
-    frames: DropOldestQueue[Frame] = DropOldestQueue(2)
+    frames = FrameQueue(2)
     async with running_robot(settings, poses) as robot:
         keeper = FloorKeeper(resolve(settings.state_dir, config_file) / "plans", ())
         with contextlib.nullcontext() if quiet else Live(console=out, auto_refresh=False) as live:

@@ -16,14 +16,13 @@ from rich.text import Text
 
 from vad.camera.board import MIN_PICTURES, Board, Kind, LensMeasurement, MeasuredLens
 from vad.camera.folder import TIMES_FILE, Recording
-from vad.camera.frame import Frame
+from vad.camera.frame import Frame, FrameQueue
 from vad.camera.lens_file import LensFile, write_lens
 from vad.commands.console import EXIT_NOTHING, JsonOption, complain, out, print_json, reported_errors
 from vad.commands.run import DEFAULT_CONFIG, ConfigOption
 from vad.commands.signals import until_ended
 from vad.config import load_settings
 from vad.errors import SourceError, VadError
-from vad.streams import DropOldestQueue
 
 KindOption = Annotated[
     Kind, typer.Option("--board", help="charuco: may be cut off by the picture's edge; chess: must be whole.")
@@ -156,7 +155,7 @@ async def _live(
 
     assert isinstance(camera_settings, CameraSettings)
     camera = camera_source(camera_settings, base)
-    frames: DropOldestQueue[Frame] = DropOldestQueue(1)
+    frames = FrameQueue(1)
     task = asyncio.create_task(camera.run(frames))
     ends_s = time.monotonic() + seconds
     try:

@@ -8,7 +8,7 @@ from typing import Any
 
 import msgspec
 
-from vad.camera.frame import Frame
+from vad.camera.frame import Frame, FrameQueue
 from vad.commands.asking import Asker
 from vad.commands.console import complain
 from vad.config import CameraSettings, RobotSettings, brings_map
@@ -30,7 +30,6 @@ from vad.setup.lan import hear_router, hear_valetudo
 from vad.setup.neato import NeatoVersion, ask_version
 from vad.setup.surroundings import Surroundings
 from vad.setup.tables import camera_words
-from vad.streams import DropOldestQueue
 
 TRY_ROBOT_S = 6.0
 PICTURE_S = 8.0
@@ -83,7 +82,7 @@ def _save_picture(ask: Asker, source: Choice, path: Path) -> None:
     from vad.daemon.adapters import camera_source
 
     async def first() -> Frame | str:
-        frames: DropOldestQueue[Frame] = DropOldestQueue(1)
+        frames = FrameQueue(1)
         camera = camera_source(msgspec.convert({"source": source}, CameraSettings), path.parent)
         task = asyncio.create_task(camera.run(frames))
         try:

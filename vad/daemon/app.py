@@ -21,7 +21,7 @@ from vad.bus.node import Bus, now_rfc3339
 from vad.bus.plan import map_message
 from vad.bus.session import BusSettings as NodeSettings
 from vad.bus.session import local_endpoints
-from vad.camera.frame import Frame
+from vad.camera.frame import FrameQueue
 from vad.camera.lens_file import camera_lens
 from vad.config import Settings, resolve
 from vad.csi.packets import CsiBatch
@@ -176,7 +176,7 @@ class Daemon:
         self._publish_map()
         self._publish_camera(eyes.calibration)
 
-        frames: DropOldestQueue[Frame] = DropOldestQueue(2)
+        frames = FrameQueue(2)
         batches: DropOldestQueue[CsiBatch] = DropOldestQueue(256)
         stations: DropOldestQueue[StationEvent] = DropOldestQueue(1024)
         group.create_task(camera.run(frames), name="camera")

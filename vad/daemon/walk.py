@@ -103,6 +103,7 @@ class WalkRecorder:
         self._lines: list[Line] = []
         self._ground = Ground()
         self._begun_ns = self._heard_ns = self._saved_ns = time.monotonic_ns()
+        self._ended_ns: int | None = None
         self._use_until_ns: int | None = None
         self._judgement = Judgement("go on")
         self._to_wifi: list[Message] = []
@@ -111,8 +112,8 @@ class WalkRecorder:
 
     @property
     def seconds(self) -> float:
-        """Since it began."""
-        return (time.monotonic_ns() - self._begun_ns) / 1e9
+        """From its begin to its end, or till now."""
+        return ((self._ended_ns or time.monotonic_ns()) - self._begun_ns) / 1e9
 
     async def record(self, on_progress: Callable[[], None]) -> Recorded:
         """Record until it is enough. Raises OSError where the folders cannot be written."""
@@ -133,6 +134,7 @@ class WalkRecorder:
                 await self._save_walk()
                 on_progress()
         finally:
+            self._ended_ns = time.monotonic_ns()
             forget()
             lines.close()
             self._ears.stop_recording()

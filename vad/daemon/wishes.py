@@ -19,15 +19,24 @@ from vad.streams import DropOldestQueue
 from vad.wall import now_rfc3339
 
 MAX_BYTES = 4096
+PATIENCE_S = 3.0
+"""Less than a client's: who asks is told that it waits (for a disk that is full), not that nobody answers."""
 _INBOX = 64
 
 _log = logging.getLogger(__name__)
 
 
 class Wishes:
-    """Answers DeviceWish queries on `vad/<hub>/wishes`, and who asks inside the daemon."""
+    """Answers DeviceWish queries on `vad/<hub>/wishes`, and who asks inside the daemon.
 
-    def __init__(self, keys: HubKeys, registry: Registry, source: m.Source) -> None:
+    A wish is granted when it is kept. One that takes longer than `patience_s` goes on; who asked is told so.
+    """
+
+    def __init__(
+        self, keys: HubKeys, registry: Registry, source: m.Source, *, patience_s: float = PATIENCE_S
+    ) -> None:
+        self._patience_s = patience_s
+        self._waiting: set[asyncio.Task[str]] = set()
         self._keys = keys
         self._registry = registry
         self._source = source
@@ -52,6 +61,9 @@ class Wishes:
                 # in a thread: an asker that does not read must not stop the loop
                 await asyncio.to_thread(partial(_send, query, self._keys.wishes, reply))
         finally:
+            for waiting in self._waiting:
+                waiting.cancel()
+            await asyncio.gather(*self._waiting, return_exceptions=True)
             # The session may be closed already.
             with contextlib.suppress(zenoh.ZError):
                 queryable.undeclare()  # type: ignore[no-untyped-call]
@@ -62,7 +74,10 @@ class Wishes:
             return m.ErrorMessage(code="bad_wish", text="The wish is too long")
         try:
             wish = m.decode(payload, m.DeviceWish)
-            text = await self._grant(wish)
+            text = await self._patiently(wish)
+        except TimeoutError:
+            text = "It waits to be kept, and is granted then: see what the store says in `vad status`"
+            return m.ErrorMessage(code="waiting", text=text)
         except msgspec.DecodeError as error:
             return m.ErrorMessage(code="bad_wish", text=f"Not a wish: {error}")
         except VadError as error:
@@ -76,6 +91,29 @@ class Wishes:
             text=text,
             ignored=self._ignored(),
         )
+
+    async def _patiently(self, wish: m.DeviceWish) -> str:
+        """`_grant` for as long as a client waits; TimeoutError where it goes on after that."""
+        granting = asyncio.create_task(self._grant(wish), name="wish")
+        try:
+            async with asyncio.timeout(self._patience_s):
+                return await asyncio.shield(granting)
+        except TimeoutError:
+            self._waiting.add(granting)
+            granting.add_done_callback(self._granted_late)
+            raise
+        except asyncio.CancelledError:
+            granting.cancel()
+            raise
+
+    def _granted_late(self, wish: asyncio.Task[str]) -> None:
+        self._waiting.discard(wish)
+        if wish.cancelled():
+            _log.warning("a wish was given up: it could not be kept")
+        elif error := wish.exception():
+            _log.warning("a wish came to nothing: %s", error)
+        else:
+            _log.info("%s", wish.result())
 
     async def _grant(self, wish: m.DeviceWish) -> str:
         """Do what is wanted; one sentence of what became of it. VadError where it cannot be."""

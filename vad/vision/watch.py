@@ -30,11 +30,13 @@ _SLACK_NS = 10_000_000
 @dataclass(frozen=True, slots=True)
 class Look:
     """What came of one picture. looked: whether all who are known were looked for; else `people` is empty
-    and says nothing. boxes: where people are as far as is known, in either case."""
+    and says nothing. boxes: where people are as far as is known, in either case. still: nothing has moved for
+    a while."""
 
     people: list[Person]
     looked: bool
     boxes: list[Box]
+    still: bool = False
 
 
 class PeopleWatch:
@@ -50,7 +52,7 @@ class PeopleWatch:
         """Take the next picture, (height, width, 3) uint8 BGR, exposed at t_ns. Blocks for 1-45 ms."""
         if not self._gate.update(image):
             self._known, self._searched_ns = [], None
-            return Look([], True, [])
+            return Look([], True, [], still=True)
         since_ns = None if self._searched_ns is None else t_ns - self._searched_ns + _SLACK_NS
         known = len(self._known)
         follow = 0 < known <= _FOLLOW_AT_MOST and self._network.takes_any_size

@@ -15,10 +15,9 @@ from typing import Any
 import numpy as np
 from pictures import number
 
-from vad.camera.frame import CameraSource, Frame
+from vad.camera.frame import CameraSource, Frame, FrameQueue
 from vad.camera.kinect2_source import Kinect2Camera
 from vad.camera.v4l2 import V4l2Camera, V4l2Settings
-from vad.streams import DropOldestQueue
 
 HERE = Path(__file__).parent
 FRAMES = 12
@@ -71,7 +70,7 @@ def seen(frames: list[Frame], arrivals_ns: dict[int, int]) -> dict[str, Any]:
     }
 
 
-class Watched(DropOldestQueue[Frame]):
+class Watched(FrameQueue):
     """A queue that notes when each frame came."""
 
     def __init__(self) -> None:

@@ -91,6 +91,7 @@ class Hub:
 
     def __init__(self) -> None:
         self._client: VadClient | None = None
+        self._said = ""
 
     def _ask(self, question: Callable[[VadClient], Any]) -> Any:
         try:
@@ -99,7 +100,10 @@ class Hub:
                 client.open()
                 self._client = client
             return question(self._client)
-        except VadError:
+        except VadError as error:
+            if str(error) != self._said:
+                say(f"no answer: {error}")
+            self._said = str(error)
             return None
 
     def status(self) -> StatusMessage | None:

@@ -52,6 +52,12 @@ TimeoutStartSec=300
 TimeoutStopSec=60
 """
 """For an emulated processor on a busy machine; everything else of the unit is the package's."""
+LOOK = """
+import json, sys, cv2
+from vad.vision.people import PoseNetwork
+people = PoseNetwork().infer(cv2.imread(sys.argv[1]))
+print(json.dumps([person.keypoints[:, :2].tolist() for person in people]))
+"""
 DISK_MB = 96
 RENAMES = 400
 FRAMES = 20
@@ -120,6 +126,17 @@ def start() -> None:
         status = hub.status()
         found["parts"] = {p.part: f"{p.state}: {p.detail}" for p in status.parts} if status else {}
         found["as user"] = Path(f"/proc/{service.pid}/status").read_text().split("Uid:")[1].split()[0]
+
+
+def look() -> None:
+    """The package's own network, in its own environment, at one picture."""
+    with row("pose network") as found:
+        picture = HERE / "frames" / f"{STORY['looked_at']:04}.jpg"
+        begun_s = time.monotonic()
+        said = sh("/usr/lib/vad/bin/python", "-I", "-c", LOOK, str(picture))
+        found["looked_s"] = round(time.monotonic() - begun_s, 1)
+        found["found"] = json.loads(said)
+        (found["on the host"],) = STORY["people"]
 
 
 def stop() -> None:
@@ -341,6 +358,7 @@ def whole() -> None:
     disk_full()
     clock_stepped("clock an hour ahead", 3600.0)
     clock_stepped("clock an hour back", -3600.0)
+    look()
     home.end()
     network.end()
     stop()

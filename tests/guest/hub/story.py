@@ -6,7 +6,8 @@
     network.onnx      a pose network that reads the number and gives what the packaged network, run here on
                       that very picture, has given; everything around it is the daemon's own
     radio.npz         the packets that a 5300 would report, with times
-    story.json        segments (start, drive, rest, walk-N): frames, robot poses, packets; the truth
+    story.json        segments (start, drive, rest, walk-N): frames, robot poses, packets; the truth; whom the
+                      packaged network, as the daemon uses it, finds in one picture
     floor.yaml, .pgm  the floor plan
 """
 
@@ -30,7 +31,7 @@ from vad.sim.home import floor_plan
 from vad.sim.radio import Radio
 from vad.sim.render import Renderer
 from vad.sim.scenario import CARRIER_HZ, Scenario, make_home
-from vad.vision.people import MODEL_PATH
+from vad.vision.people import MODEL_PATH, PoseNetwork
 
 SEED = 1
 STATION_MAC = "f4:f5:d8:d3:35:b2"
@@ -225,8 +226,12 @@ def main() -> None:
     onnx.save(reading_network(np.stack(film.answers)), str(folder / "network.onnx"))
     film.check(folder / "network.onnx")
     offset = np.subtract(home.anchor_m, home.camera.eye_m)
+    looked_at = parts["walk-0"]["frames"][len(parts["walk-0"]["frames"]) // 2]
+    picture = np.asarray(cv2.imread(str(folder / "frames" / f"{looked_at:04}.jpg")), dtype=np.uint8)
     story = {
         "fps": FPS,
+        "looked_at": looked_at,
+        "people": [person.keypoints[:, :2].tolist() for person in PoseNetwork().infer(picture)],
         "poses_per_s": POSES_PER_S,
         "segments": parts,
         "mac": home.device_mac,

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 from vad.commands.doctor.visit import Finding, Visit
 from vad.config import FolderCameraSettings, Kinect2CameraSettings, V4l2CameraSettings
 from vad.errors import VadError
-from vad.streams import DropOldestQueue
 
 if TYPE_CHECKING:
     from vad.camera.v4l2_formats import V4l2Description
@@ -82,14 +81,14 @@ def format_finding(source: V4l2CameraSettings, description: V4l2Description) -> 
 
 async def _measured(visit: Visit) -> list[Finding]:
     """Open the camera and count pictures."""
-    from vad.camera.frame import Frame
+    from vad.camera.frame import FrameQueue
     from vad.daemon.adapters import camera_source
 
     try:
         camera = camera_source(visit.settings.camera, visit.config_file.parent)
     except VadError as error:
         return [Finding.of_error("camera", error)]
-    frames: DropOldestQueue[Frame] = DropOldestQueue(4)
+    frames = FrameQueue(4)
     task = asyncio.create_task(camera.run(frames))
     try:
         async with asyncio.timeout(visit.listen_s):
