@@ -22,6 +22,8 @@ import numpy as np
 import pytest
 from guest_world import Guest
 
+from vad.mapping.camera_stage import MAX_POSITION_SIGMA_M
+
 HERE = Path(__file__).parent
 READY_S = 120.0
 """A hub takes a twentieth of what an emulated processor on a busy machine takes."""
@@ -113,7 +115,8 @@ class TestHub:
 
     def test_camera_finds_its_place_from_the_robots_drive(self, report: dict[str, Any]) -> None:
         row = came(report, "camera calibrated")
-        assert row["off_m"] < 0.3
+        # A short drive, few pictures: twice the spread from which on the daemon calls it valid.
+        assert row["off_m"] < 2.0 * MAX_POSITION_SIGMA_M
 
     def test_packaged_network_sees_what_it_saw_on_the_host(self, report: dict[str, Any]) -> None:
         row = came(report, "pose network")

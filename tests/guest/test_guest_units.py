@@ -123,8 +123,8 @@ def test_the_watchdog_ends_what_hangs_and_systemd_starts_it_anew(report: dict[st
     assert re.fullmatch(r"active restarts [1-9]\d*", report["then"])
 
 
-# Not here: stopping, which waits for the pose network's picture, under emulation 11 s; tests/guest/test_guest_hub.py
-# stops a daemon with a quicker network.
+# Not here: stopping, which waits for the pose network's picture, under emulation 11 s;
+# tests/guest/test_guest_hub.py stops a daemon with a quicker network.
 
 
 def test_vad_install_narrows_it_to_its_settings(folder: Path, report: dict[str, str]) -> None:

@@ -98,9 +98,9 @@ async def test_unplugged_and_plugged_in_again(tmp_path: Path, caplog: pytest.Log
             await take(out)
         assert not link.exists()
         # Long enough for the back-off to reach its end.
-        await until(lambda: _count(caplog, "No such file") >= 4, 8.0)
+        await until(lambda: _count(caplog, "no such port") >= 4, 8.0)
         assert source.health.state == "degraded"
-        assert _count(caplog, "No such file", logging.WARNING) == 1
+        assert _count(caplog, "no such port", logging.WARNING) == 1
         out.drain()
         second = VirtualNeato(circle, link=link)
         plugged_s = time.monotonic()

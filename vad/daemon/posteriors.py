@@ -4,11 +4,32 @@ from __future__ import annotations
 
 import numpy as np
 
+from vad.mapping.device_stage import PlaceEstimate
 from vad.mapping.evidence import Terms
 from vad.mapping.plan_match import PlanTransform
 from vad.mapping.posterior import Grid, Posterior
 from vad.mapping.reanchor import moved_posterior
-from vad.store.records import PosteriorRecord
+from vad.robot.floor_plan import FloorPlan
+from vad.store.records import Estimate, PosteriorRecord
+
+METHOD = "spectrogram-likelihood"
+
+
+def estimate_of(place: PlaceEstimate, plan: FloorPlan, height90_m: tuple[float, float] | None) -> Estimate:
+    """A place as the store keeps it, with its room. height90_m: where 90 % of its heights are."""
+    x_m, y_m = (float(v) for v in place.xy_m)
+    (a, b), (_, c) = place.covariance_m2.tolist()
+    outline = place.region90_m[0] if place.region90_m else np.empty((0, 2))
+    return Estimate(
+        x_m,
+        y_m,
+        ((a, b), (b, c)),
+        place.radius90_m,
+        tuple((float(x), float(y)) for x, y in outline),
+        plan.room_at(x_m, y_m),
+        METHOD,
+        height90_m,
+    )
 
 
 def terms_of(stored: PosteriorRecord) -> Terms:

@@ -14,7 +14,7 @@ from vad.bus.node import Bus, now_rfc3339
 from vad.config import Settings
 from vad.daemon.device_message import device_message
 from vad.daemon.floor import moved_estimate
-from vad.daemon.posteriors import moved_terms, stored_terms, terms_of
+from vad.daemon.posteriors import estimate_of, moved_terms, stored_terms, terms_of
 from vad.daemon.roster import Roster
 from vad.daemon.verdict import another_walk, verdict
 from vad.devices.device import Device
@@ -27,10 +27,9 @@ from vad.mapping.plan_match import IDENTITY, PlanTransform
 from vad.mapping.posterior import Grid, Posterior
 from vad.robot.floor_plan import FloorPlan
 from vad.solve import on_plan, plan_prior
-from vad.store.records import DeviceRecord, Estimate, PosteriorRecord
+from vad.store.records import DeviceRecord, PosteriorRecord
 from vad.store.worker import StoreWorker
 
-METHOD = "spectrogram-likelihood"
 AWAY_NS = 30_000_000_000
 """A device that was out of the network for so long may have been carried elsewhere."""
 PARTED = "two devices were taken for one, and its walks may be the other's: it is measured again"
@@ -333,7 +332,7 @@ class Registry:
                 "packets": counts.get("packets", 0.0) + packets,
                 "walk_s": round(counts.get("walk_s", 0.0) + walk_s, 1),
             },
-            estimate=self._estimate(place, total.height_range_m()),
+            estimate=estimate_of(place, self._plan, total.height_range_m()),
             updated_at=now,
         )
         stored = stored_terms(mac, self._plan.epoch, total, now)
@@ -360,20 +359,6 @@ class Registry:
         if not same or not np.allclose(before.grid.bounds_m, grid.bounds_m):
             return moved_terms(before, IDENTITY, grid)  # the plan has grown since
         return replace(before, grid=grid)
-
-    def _estimate(self, place: PlaceEstimate, height90_m: tuple[float, float] | None) -> Estimate:
-        (a, b), (_, c) = place.covariance_m2.tolist()
-        outline = place.region90_m[0] if place.region90_m else np.empty((0, 2))
-        return Estimate(
-            float(place.xy_m[0]),
-            float(place.xy_m[1]),
-            ((a, b), (b, c)),
-            place.radius90_m,
-            tuple((float(x), float(y)) for x, y in outline),
-            self._plan.room_at(float(place.xy_m[0]), float(place.xy_m[1])),
-            METHOD,
-            height90_m,
-        )
 
     async def _keep(self, record: DeviceRecord, posterior: PosteriorRecord | None = None) -> None:
         if record.mac not in self._devices:
