@@ -27,7 +27,7 @@ except ImportError:
     csiread = None
 
 PACKETS = 40_000
-ROUNDS = 7
+ROUNDS = 15
 
 
 def make_log(n_tx: int, packets: int, *, changing: bool) -> bytes:

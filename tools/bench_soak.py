@@ -10,8 +10,8 @@ of its own comes every day and never again; some of the day's walks are recorded
 estimator (all would take hours: --walks says how many a day, the others pass with the camera covered);
 pictures, packets and poses come by the hundred; clients ask everything there is to ask. At each midnight
 memory, descriptors, threads and tasks are counted. The radio is simulated in a process of its own. Exit code
-1 where memory grew by more than 5 % after the first fifth of the time, where descriptors, threads or tasks
-did, or where a device was lost.
+1 where memory grew by more than 5 % after the first fifth of the time (six days at least), where descriptors,
+threads or tasks did, or where a device was lost.
 """
 
 from __future__ import annotations
@@ -60,7 +60,8 @@ from vad.streams import DropOldestQueue
 from vad.vision.people import PoseNetwork
 
 GROWTH_BAR = 0.05
-WARM_SHARE = 0.2
+WARM_SHARE, WARM_DAYS = 0.2, 6
+"""Caches fill and threads start in the first days, however long it goes on."""
 LEAVES_H, RETURNS_H = 8.5, 17.5
 GUEST_H = (18.0, 20.0)
 PICTURES, MOVING, BATCHES, STATUSES, POSES = 90, 45, 100, 100, 500
@@ -98,7 +99,8 @@ class Month:
     @property
     def warm(self) -> Midnight:
         """The end of the warm-up."""
-        return self.nights[max(0, round(len(self.nights) * WARM_SHARE) - 1)]
+        days = max(WARM_DAYS, round(len(self.nights) * WARM_SHARE))
+        return self.nights[min(days, len(self.nights)) - 1]
 
     @property
     def after(self) -> list[Midnight]:
