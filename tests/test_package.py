@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
+
+from vad.sim.render import Renderer
+from vad.sim.scenario import make_home
+from vad.vision.people import PoseNetwork
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500)]
 
 ROOT = Path(__file__).resolve().parents[1]
 NEEDED = ("mmdebstrap", "chroot", "mount")
 DEPENDS = "python3.11,libstdc++6,zlib1g,libusb-1.0-0,systemd,udev"
+ARM64 = Path("/proc/sys/fs/binfmt_misc/qemu-aarch64")
 MOST_MB = 200
 """What a hub has to fetch."""
 IGNORED = ("var/log", "var/lib/dpkg", "var/cache", "proc", "run", "root", "tmp", "dev", "etc/.pwd.lock")
@@ -53,19 +62,17 @@ class Debian:
         return found
 
 
-@pytest.fixture(scope="module")
-def debian(package: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Debian]:
-    """With what the package depends on."""
+@contextmanager
+def debian_in(root: Path, arch: str) -> Iterator[Debian]:
+    """One of this architecture, with what the package depends on."""
     if missing := [tool for tool in NEEDED if shutil.which(tool) is None]:
         pytest.skip(f"no {', '.join(missing)}: apt-get install mmdebstrap mount")
     if os.geteuid() != 0:
         pytest.skip("a root folder of Debian's needs root")
-    assert package.is_file()
-    root = tmp_path_factory.mktemp("debian") / "root"
     made = subprocess.run(
         ["mmdebstrap", "--quiet", "--variant=minbase", "--mode=root", "--skip=check/empty",
-         f"--include={DEPENDS}", '--aptopt=APT::Install-Recommends "false"', "--dpkgopt=force-unsafe-io",
-         "--dpkgopt=path-exclude=/usr/share/man/*", "bookworm", str(root)],
+         f"--architectures={arch}", f"--include={DEPENDS}", '--aptopt=APT::Install-Recommends "false"',
+         "--dpkgopt=force-unsafe-io", "--dpkgopt=path-exclude=/usr/share/man/*", "bookworm", str(root)],
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert made.returncode == 0, made.stderr[-2000:]
@@ -74,6 +81,14 @@ def debian(package: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
         yield Debian(root)
     finally:
         subprocess.run(["umount", root / "proc"], check=True)
+
+
+@pytest.fixture(scope="module")
+def debian(package: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Debian]:
+    """One as here."""
+    assert package.is_file()
+    with debian_in(tmp_path_factory.mktemp("debian") / "root", "amd64") as here:
+        yield here
 
 
 def test_it_is_not_too_large_and_carries_no_path_of_the_builder(package: Path, tmp_path: Path) -> None:
@@ -149,3 +164,36 @@ def later(package: Path, folder: Path, tmp_path: Path) -> str:
     build = ["dpkg-deb", "--root-owner-group", "-Zzstd", "-z1", "--build", tree, folder / "later.deb"]
     subprocess.run(build, check=True, capture_output=True)
     return "later.deb"
+
+
+LOOK = """
+import json, platform, sys
+import cv2, msgspec, serial, usb, yaml, zenoh
+from vad.vision.people import PoseNetwork
+people = PoseNetwork().infer(cv2.imread(sys.argv[1]))
+print(json.dumps([platform.machine(), [person.keypoints[:, :2].tolist() for person in people]]))
+"""
+
+
+def test_the_arm64_package_runs_and_sees_the_same(tmp_path: Path) -> None:
+    """Emulated; what a Raspberry Pi would install."""
+    if not ARM64.exists():
+        pytest.skip("no arm64 emulation: apt-get install qemu-user-static binfmt-support")
+    build = [str(ROOT / "tools" / "deb" / "build"), "--arch", "arm64", "--out", str(tmp_path)]
+    subprocess.run(build, check=True, capture_output=True)
+    picture = tmp_path / "people.png"
+    home = make_home(1)
+    cv2.imwrite(str(picture), Renderer(home).frame(home.walks[0].start_s + 6.0))
+    with debian_in(tmp_path / "root", "arm64") as there:
+        for file in (picture, next(tmp_path.glob("vad_*_arm64.deb"))):
+            shutil.copy(file, there.root / "root")
+        there.run("sh", "-c", "dpkg -i /root/vad_*_arm64.deb")
+        assert there.run("vad", "--version").strip()
+        there.run("sh", "-c", "cp /usr/share/doc/vad/examples/vad.yaml /etc/vad/")
+        assert "the settings are usable" in there.run("vad", "check-config")
+        said = there.run("/usr/lib/vad/bin/python", "-I", "-c", LOOK, "/root/people.png")
+        machine, found = json.loads(said.splitlines()[0])
+    assert machine == "aarch64"
+    here = [person.keypoints[:, :2].tolist() for person in PoseNetwork().infer(cv2.imread(str(picture)))]
+    assert len(here) == 1
+    np.testing.assert_allclose(found, here, atol=0.5)
