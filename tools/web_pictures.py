@@ -15,9 +15,11 @@ from pathlib import Path
 from bench_web_browser import Browser
 from bench_week_sim import Simulation, settings_for
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "web"))
 
-from web_world import status, until
+from waiting import until
+from web_world import status
 
 from vad.bus import messages as m
 from vad.bus.grid import grid_to_png

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import socket
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 import numpy as np
 import zenoh
+from waiting import until
 
 from vad.agent.info import AgentInfo
 from vad.agent.node import Node
@@ -26,23 +26,6 @@ HUB = "home"
 MAC = "00:16:ea:00:00:01"
 KEYS = HubKeys(HUB)
 BFEE = 0xBB
-
-
-def free_port() -> int:
-    """A TCP port of the loopback interface where nobody listens."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-async def until(condition: Callable[[], bool], what: str, timeout_s: float = 15.0) -> None:
-    """Wait until the condition holds."""
-    try:
-        async with asyncio.timeout(timeout_s):
-            while not condition():  # noqa: ASYNC110 - what is waited for has no event
-                await asyncio.sleep(0.01)
-    except TimeoutError:
-        raise AssertionError(f"not in {timeout_s:.0f} s: {what}") from None
 
 
 class Card:

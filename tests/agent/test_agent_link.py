@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from agent_world import KEYS, MAC, Card, free_port, hearing, router, running_node, there, until
+from agent_world import KEYS, MAC, Card, hearing, router, running_node, there
 from bad_network import BadNetwork
+from waiting import free_port, until
 
 from vad.agent.frames import MAX_FRAME_BYTES
 from vad.agent.info import decode_info

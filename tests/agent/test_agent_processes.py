@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zenoh
-from agent_world import KEYS, MAC, Card, free_port, hearing, router, there, until
+from agent_world import KEYS, MAC, Card, hearing, router, there
+from waiting import free_port, until
 
 from vad.agent.frames import Frame, decode_frame
 from vad.capture.handshake import CameraSide, Message, WifiSide

@@ -8,7 +8,8 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
-from agent_world import HUB, KEYS, Card, free_port, hearing, router, running_node, there, until
+from agent_world import HUB, KEYS, Card, hearing, router, running_node, there
+from waiting import free_port, until
 
 from vad.bus.gate import Gate, GateSettings
 from vad.capture.handshake import Start, Started

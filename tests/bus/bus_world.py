@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import Callable
 from pathlib import Path
 
 import zenoh
@@ -52,10 +50,3 @@ def settings(endpoint: str, hub: str = "home") -> BusSettings:
 def ask_raw(endpoint: str, selector: str) -> list[zenoh.Reply]:
     with open_session(BusSettings(mode="client", connect=(endpoint,))) as session:
         return list(session.get(selector, target=zenoh.QueryTarget.ALL, timeout=5.0))
-
-
-async def until(condition: Callable[[], bool], what: str, timeout_s: float = 10.0) -> None:
-    async with asyncio.timeout(timeout_s):
-        while not condition():  # noqa: ASYNC110 - zenoh's side has no asyncio event to wait for
-            await asyncio.sleep(0.01)
-    assert condition(), what

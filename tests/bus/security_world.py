@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import socket
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import TypeVar
 
 import zenoh
-from bus_world import until
+from waiting import free_port, until
 
 from vad.bus.gate import Gate, GateSettings
 from vad.bus.session import BusSettings, open_session
@@ -24,12 +23,6 @@ from vad.pki.folder import PkiFolder
 HUB = "home"
 
 T = TypeVar("T")
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @dataclass

@@ -7,7 +7,8 @@ from contextlib import aclosing
 
 import numpy as np
 import pytest
-from bus_world import BROKEN_HEATMAP, device, mac, settings, until
+from bus_world import BROKEN_HEATMAP, device, mac, settings
+from waiting import until
 
 from vad.bus import messages as m
 from vad.bus.node import Bus

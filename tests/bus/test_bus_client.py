@@ -9,7 +9,8 @@ import threading
 import zlib
 
 import pytest
-from bus_world import BROKEN_HEATMAP, ROOT, device, mac, settings, until
+from bus_world import BROKEN_HEATMAP, ROOT, device, mac, settings
+from waiting import until
 
 from vad.bus import messages as m
 from vad.bus.node import Bus

@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 import pytest
 import zenoh
-from bus_world import ask_raw, device, mac, settings, until
+from bus_world import ask_raw, device, mac, settings
+from waiting import until
 
 from vad.bus import messages as m
 from vad.bus.answers import HistoryError

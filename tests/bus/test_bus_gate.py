@@ -9,8 +9,8 @@ from datetime import timedelta
 from pathlib import Path
 
 import pytest
-from bus_world import until
-from security_world import free_port, network
+from security_world import network
+from waiting import free_port, until
 
 from vad.bus.access import Holder, access_control
 from vad.bus.gate import Gate, GateSettings, renew_hub

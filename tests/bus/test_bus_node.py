@@ -8,7 +8,8 @@ import time
 import numpy as np
 import pytest
 import zenoh
-from bus_world import BROKEN_HEATMAP, ask_raw, device, mac, settings, until
+from bus_world import BROKEN_HEATMAP, ask_raw, device, mac, settings
+from waiting import until
 
 from vad.bus import messages as m
 from vad.bus.grid import grid_to_png

@@ -13,8 +13,9 @@ from pathlib import Path
 
 import pytest
 import zenoh
-from bus_world import ROOT, until
-from security_world import Network, answer, ask, free_port, gate_pid, network, on
+from bus_world import ROOT
+from security_world import Network, answer, ask, gate_pid, network, on
+from waiting import free_port, until
 
 from vad.bus.session import LEASE_MS, BusSettings, open_session
 from vad.errors import VadError

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 import zenoh
-from bus_world import until
 from security_world import Network, answer, ask, gate_pid, memory_kib, network, on
+from waiting import until
 
 from vad.bus.gate import TOLD_EACH
 from vad.client import VadClient

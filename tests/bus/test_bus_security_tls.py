@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 import zenoh
-from bus_world import until
-from security_world import HUB, Network, free_port, linked, network
+from security_world import HUB, Network, linked, network
+from waiting import free_port, until
 
 from vad.bus.gate import WATCH_S
 from vad.bus.session import BusSettings, _client_tls, open_config, open_session, plain_config

@@ -6,12 +6,13 @@ import asyncio
 import base64
 import logging
 import time
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from collections.abc import Callable
 
 import cv2
 import numpy as np
 import pytest
+from camera_world import running
+from waiting import until
 
 from vad.camera.frame import Frame, FrameQueue
 from vad.camera.http_stream import HttpStreamCamera, decode_jpeg
@@ -23,23 +24,6 @@ def jpeg(value: int, width: int = 64, height: int = 48) -> bytes:
     good, data = cv2.imencode(".jpg", np.full((height, width, 3), value, np.uint8))
     assert good
     return data.tobytes()
-
-
-async def until(condition: Callable[[], bool], timeout_s: float = 5.0) -> None:
-    async with asyncio.timeout(timeout_s):
-        while not condition():  # noqa: ASYNC110
-            await asyncio.sleep(0.005)
-
-
-@asynccontextmanager
-async def running(camera: HttpStreamCamera) -> AsyncIterator[FrameQueue]:
-    out = FrameQueue(100)
-    task = asyncio.create_task(camera.run(out))
-    try:
-        yield out
-    finally:
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
 
 
 async def next_frame(out: FrameQueue) -> Frame:

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import struct
-import threading
 import time
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
 
 import cv2
 import numpy as np
 import pytest
+from camera_world import running
 from hypothesis import given
 from hypothesis import strategies as st
 from usb_world import Kinect, packet
+from waiting import until
 
 from vad.camera import kinect2
-from vad.camera.frame import FrameQueue
 from vad.camera.kinect2_source import Kinect2Camera
 from vad.errors import ProtocolError
 
@@ -121,24 +119,6 @@ def test_a_picture_that_never_ends_is_given_up() -> None:
 
 
 # The adapter.
-
-
-async def until(condition: Callable[[], bool], timeout_s: float = 10.0) -> None:
-    async with asyncio.timeout(timeout_s):
-        while not condition():  # noqa: ASYNC110
-            await asyncio.sleep(0.005)
-
-
-@asynccontextmanager
-async def running(camera: Kinect2Camera) -> AsyncIterator[FrameQueue]:
-    out = FrameQueue(100)
-    task = asyncio.create_task(camera.run(out))
-    try:
-        yield out
-    finally:
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
-        assert not [t for t in threading.enumerate() if t.name.startswith("kinect2")]
 
 
 async def test_opening_follows_the_protocol_and_so_does_the_end() -> None:

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import asyncio
 import subprocess
 import threading
 import time
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
+from camera_world import running
 from numpy.typing import NDArray
 from rtsp_world import RtspServer
+from waiting import until
 
-from vad.camera.frame import FrameQueue
 from vad.camera.rtsp import RtspCamera, Transport
 from vad.errors import ConfigError
 
@@ -33,24 +31,6 @@ def picture(k: int) -> NDArray[np.uint8]:
 def number(image: NDArray[np.uint8]) -> int:
     means = image.reshape(image.shape[0], STRIPES, -1).mean((0, 2))
     return sum(int(mean > 128) << bit for bit, mean in enumerate(means))
-
-
-async def until(condition: Callable[[], bool], timeout_s: float = 15.0) -> None:
-    async with asyncio.timeout(timeout_s):
-        while not condition():  # noqa: ASYNC110
-            await asyncio.sleep(0.005)
-
-
-@asynccontextmanager
-async def running(camera: RtspCamera, depth: int = 500) -> AsyncIterator[FrameQueue]:
-    out = FrameQueue(depth)
-    task = asyncio.create_task(camera.run(out))
-    try:
-        yield out
-    finally:
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
-        assert not [t for t in threading.enumerate() if t.name.startswith("rtsp")]
 
 
 async def test_pictures_come_in_order_with_the_streams_times() -> None:
@@ -173,17 +153,17 @@ async def test_h264_of_gstreamers_server(transport: Transport) -> None:
         port = int(server.stdout.readline())
         camera = RtspCamera(f"rtsp://127.0.0.1:{port}/live", transport=transport)
         async with running(camera) as out:
-            await until(lambda: len(out) >= 50, 40.0)
+            await until(lambda: len(out) >= 50, timeout_s=40.0)
             frames = out.drain()
             assert camera.health.detail == "320x240, stamps: stream"
             steps_ms = np.diff([f.t_ns for f in frames]) * 1e-6
             assert np.median(steps_ms[10:]) == pytest.approx(40.0, abs=2.0)
             assert frames[0].image.shape == (240, 320, 3)
             server.terminate()
-            await until(lambda: camera.health.state == "degraded", 15.0)
+            await until(lambda: camera.health.state == "degraded", timeout_s=15.0)
         with gstreamer(port) as again:
             assert again.stdout is not None
             assert int(again.stdout.readline()) == port
             async with running(camera) as out:
-                await until(lambda: len(out) >= 10, 40.0)
+                await until(lambda: len(out) >= 10, timeout_s=40.0)
             again.terminate()

@@ -13,6 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from waiting import until
 
 from vad.camera.frame import FrameQueue
 from vad.camera.v4l2 import V4l2Camera, V4l2Settings, open_v4l2
@@ -69,12 +70,6 @@ class Handle:
 
 def monotonic_ms() -> float:
     return time.monotonic_ns() * 1e-6
-
-
-async def until(condition: Callable[[], bool], timeout_s: float = 5.0) -> None:
-    async with asyncio.timeout(timeout_s):
-        while not condition():  # noqa: ASYNC110
-            await asyncio.sleep(0.005)
 
 
 async def test_driver_stamps_unplug_and_replug() -> None:

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 from doctor_world import STRANGER, open_to_all, verdicts, visit, write
+from waiting import free_port, until
 
 from vad.camera.v4l2_formats import Format, V4l2Description
 from vad.commands.doctor import robot, sight
@@ -29,8 +30,8 @@ from vad.sim.neato import VirtualNeato
 
 sys.path.append(str(Path(__file__).parents[1] / "csi"))
 sys.path.append(str(Path(__file__).parents[1] / "homeassistant"))
-from csi_tools import bodies, until
-from mosquitto_world import Mosquitto, free_port, needs_mosquitto
+from csi_tools import bodies
+from mosquitto_world import Mosquitto, needs_mosquitto
 
 CONNECTOR = {"source": {"type": "connector", "group": 12}}
 

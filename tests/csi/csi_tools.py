@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 
 import numpy as np
+from waiting import until
 
 from vad.csi.bfee import encode_bodies
 from vad.csi.packets import CsiBatch, CsiSource
@@ -18,16 +19,6 @@ def bodies(n: int, first: int = 0) -> list[bytes]:
     count = np.arange(first, first + n)
     csi = np.ones((n, 30, 3, 1, 2), np.int8)
     return encode_bodies(csi, nic_us=1000 * count, bfee_count=count, rssi=(30, 31, 32))
-
-
-async def until(condition: Callable[[], bool], timeout_s: float = 5.0) -> None:
-    """Wait until the condition holds; TimeoutError if it does not within the time."""
-    pause_s = 0.005
-    for _ in range(int(timeout_s / pause_s)):
-        if condition():
-            return
-        await asyncio.sleep(pause_s)
-    raise TimeoutError
 
 
 @contextlib.asynccontextmanager

@@ -9,7 +9,8 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from csi_tools import bodies, running, until
+from csi_tools import bodies, running
+from waiting import until
 
 from vad.csi import cn
 from vad.csi.connector import Connector

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from csi_tools import bodies, running, until
+from csi_tools import bodies, running
+from waiting import until
 
 from vad.csi import follow
 from vad.csi.follow import FollowLog

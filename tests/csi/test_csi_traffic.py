@@ -12,7 +12,7 @@ from collections.abc import AsyncIterator, Iterator
 from dataclasses import dataclass
 
 import pytest
-from csi_tools import until
+from waiting import until
 
 from vad.csi.traffic import EchoTraffic
 from vad.errors import VadError
@@ -108,7 +108,7 @@ async def test_a_device_that_answers(peer: Peer) -> None:
     traffic = EchoTraffic(peer.address, 400)
     counters = traffic.health.counters
     async with sending(traffic):
-        await until(lambda: counters["replies"] >= 300, 10)
+        await until(lambda: counters["replies"] >= 300, timeout_s=10)
         assert traffic.health.state == "ok"
         assert "answered" in traffic.health.detail
     assert counters["replies"] >= counters["sent"] - 20
@@ -122,7 +122,7 @@ async def test_thirty_percent_loss_brings_the_rate_down(poor_peer: Peer) -> None
     traffic = EchoTraffic(poor_peer.address, 400)
     counters = traffic.health.counters
     async with sending(traffic):
-        await until(lambda: counters["backed_off"] >= 4, 15)
+        await until(lambda: counters["backed_off"] >= 4, timeout_s=15)
         assert counters["replies"] > 0
         assert counters["lost"] > 0.15 * counters["sent"]
 
@@ -130,8 +130,8 @@ async def test_thirty_percent_loss_brings_the_rate_down(poor_peer: Peer) -> None
 async def test_a_device_that_is_silent_is_told_once(peer: Peer, caplog: pytest.LogCaptureFixture) -> None:
     traffic = EchoTraffic(f"{_NET}.77", 200)
     async with sending(traffic):
-        await until(lambda: traffic.health.state == "degraded", 10)
-        await until(lambda: traffic.health.counters["backed_off"] >= 3, 10)
+        await until(lambda: traffic.health.state == "degraded", timeout_s=10)
+        await until(lambda: traffic.health.counters["backed_off"] >= 3, timeout_s=10)
     assert "does not answer" in traffic.health.detail
     assert [r.levelname for r in caplog.records].count("WARNING") == 1
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -29,13 +27,6 @@ STOP_S = 2.0
 LONG_AGO = "2026-01-01T00:00:00.000Z"
 
 
-def free_port() -> int:
-    """A TCP port of the loopback interface where nobody listens."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 def wait_for(ask: Callable[[], T | None], what: str, timeout_s: float = 30.0) -> T:
     """The first answer that is something; `what` is told of where none comes in time."""
     until = time.monotonic() + timeout_s
@@ -44,16 +35,6 @@ def wait_for(ask: Callable[[], T | None], what: str, timeout_s: float = 30.0) ->
             return answer
         time.sleep(0.02)
     raise AssertionError(f"not in {timeout_s:.0f} s: {what}")
-
-
-async def until(condition: Callable[[], bool], what: str, timeout_s: float = 10.0) -> None:
-    """The same on the event loop."""
-    try:
-        async with asyncio.timeout(timeout_s):
-            while not condition():  # noqa: ASYNC110 - what is waited for has no event
-                await asyncio.sleep(0.02)
-    except TimeoutError:
-        raise AssertionError(f"not in {timeout_s:.0f} s: {what}") from None
 
 
 def store_calibration(state_dir: Path, scenario: Scenario) -> None:

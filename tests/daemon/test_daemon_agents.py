@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from daemon_world import free_port, settings_for, until
+from daemon_world import settings_for
+from waiting import free_port, until
 
 from vad.agent.info import AgentInfo
 from vad.agent.node import Node

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from daemon_world import LONG_AGO, Vad, connect, free_port
+from daemon_world import LONG_AGO, Vad, connect
+from waiting import free_port
 
 from vad.bus.messages import CameraMessage
 from vad.client import VadClient

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from daemon_world import until
 from test_daemon_parts import Hub, hub
+from waiting import until
 
 from vad.camera.folder import Recording
 from vad.camera.frame import Frame

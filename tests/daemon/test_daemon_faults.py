@@ -16,7 +16,8 @@ from typing import TypeVar
 import cv2
 import numpy as np
 import yaml
-from daemon_world import Vad, connect, free_port, store_calibration
+from daemon_world import Vad, connect, store_calibration
+from waiting import free_port
 
 from vad.bus.messages import DeviceMessage, Part, StatusMessage
 from vad.client import VadClient

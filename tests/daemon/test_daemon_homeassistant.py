@@ -9,7 +9,8 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from daemon_world import Vad, change_settings, connect, free_port, store_calibration, wait_for
+from daemon_world import Vad, change_settings, connect, store_calibration, wait_for
+from waiting import free_port
 
 from vad.bus import messages as m
 from vad.homeassistant.topics import Topics

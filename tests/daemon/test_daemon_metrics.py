@@ -10,8 +10,8 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
-from daemon_world import free_port, until
 from prometheus_client.parser import text_string_to_metric_families
+from waiting import free_port, until
 
 from vad.bus import messages as m
 from vad.bus.answers import HistoryError

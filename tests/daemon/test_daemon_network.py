@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 import yaml
-from daemon_world import Vad, change_settings, connect, free_port, wait_for
+from daemon_world import Vad, change_settings, connect, wait_for
+from waiting import free_port
 
 from vad.client import UnreachableError, VadClient
 

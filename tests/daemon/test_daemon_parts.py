@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from daemon_world import free_port, settings_for, until
+from daemon_world import settings_for
 from numpy.typing import NDArray
+from waiting import free_port, until
 
 from vad.bus.node import Bus
 from vad.bus.session import BusSettings

@@ -13,7 +13,8 @@ from typing import TypeVar
 import msgspec
 import numpy as np
 import pytest
-from daemon_world import LONG_AGO, free_port, settings_for
+from daemon_world import LONG_AGO, settings_for
+from waiting import free_port
 
 from vad.bus import messages as m
 from vad.bus.node import Bus

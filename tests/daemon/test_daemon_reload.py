@@ -14,7 +14,8 @@ from typing import Any
 
 import pytest
 import yaml
-from daemon_world import free_port, wait_for
+from daemon_world import wait_for
+from waiting import free_port
 
 from vad.client import UnreachableError, VadClient
 from vad.errors import VadError

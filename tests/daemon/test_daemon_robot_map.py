@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from daemon_world import LONG_AGO, Vad, connect, free_port, store_calibration, wait_for
+from daemon_world import LONG_AGO, Vad, connect, store_calibration, wait_for
 from test_daemon_floor import home, turned
+from waiting import free_port
 
 from vad.robot.floor_plan import FREE, OCCUPIED, FloorPlan
 from vad.sim.calibration import true_calibration

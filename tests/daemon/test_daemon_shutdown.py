@@ -12,14 +12,8 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 
 import pytest
-from daemon_world import (
-    Vad,
-    change_settings,
-    connect,
-    free_port,
-    store_calibration,
-    wait_for,
-)
+from daemon_world import Vad, change_settings, connect, store_calibration, wait_for
+from waiting import free_port
 
 from vad.client import VadClient
 from vad.sim.scenario import make_home

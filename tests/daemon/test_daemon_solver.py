@@ -10,7 +10,7 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
-from daemon_world import until
+from waiting import until
 from walk_sessions import record_walk
 
 from vad.daemon.solver import Solver

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from daemon_world import LONG_AGO, Vad, change_settings, connect, free_port, store_calibration, wait_for
+from daemon_world import LONG_AGO, Vad, change_settings, connect, store_calibration, wait_for
+from waiting import free_port
 
 from vad.sim.scenario import make_home
 from vad.store.records import DeviceRecord, Estimate, PosteriorRecord

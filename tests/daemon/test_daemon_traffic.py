@@ -7,7 +7,7 @@ import socket
 from collections.abc import AsyncIterator
 
 import pytest
-from daemon_world import until
+from waiting import until
 
 from vad.daemon.traffic import Traffic
 

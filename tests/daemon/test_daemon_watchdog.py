@@ -6,9 +6,9 @@ import asyncio
 import threading
 
 import pytest
-from daemon_world import until
 from hypothesis import given
 from hypothesis import strategies as st
+from waiting import until
 
 from vad.daemon.watchdog import FEED_S, PATIENCE_S, Watchdog, Worker, feed_every_s
 from vad.streams import DropOldestQueue

@@ -11,8 +11,9 @@ from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
 
 import pytest
-from daemon_world import free_port, settings_for
+from daemon_world import settings_for
 from typer.testing import CliRunner
+from waiting import free_port
 
 from vad.bus import messages as m
 from vad.bus.node import Bus

@@ -5,10 +5,11 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Iterator
 
 import pytest
 import zenoh
+from waiting import until
 
 from vad.agent.info import AgentInfo, decode_info, encode_info
 from vad.bus.keys import HubKeys
@@ -84,12 +85,6 @@ async def running(router: zenoh.Session, out: Events) -> AsyncIterator[AgentSour
         task.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await task
-
-
-async def until(condition: Callable[[], bool], timeout_s: float = 8.0) -> None:
-    async with asyncio.timeout(timeout_s):
-        while not condition():  # noqa: ASYNC110 - what is waited for has no event
-            await asyncio.sleep(0.005)
 
 
 async def take(out: Events) -> tuple[str, str, str | None, str | None, str]:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import struct
-from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from source_world import running
+from waiting import until
 
 from vad.devices.inotify import CREATE, MODIFY, FileEvent, Inotify, parse_events
 from vad.devices.lease_source import LeaseSource
@@ -111,24 +111,6 @@ def test_the_kernels_own_events(tmp_path: Path) -> None:
             watcher.watch(tmp_path / "none", MODIFY)
     finally:
         watcher.close()
-
-
-@contextlib.asynccontextmanager
-async def running(source: LeaseSource, out: Events) -> AsyncIterator[None]:
-    task = asyncio.create_task(source.run(out))
-    try:
-        yield
-    finally:
-        assert not task.done(), task
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
-
-
-async def until(condition: Callable[[], bool], timeout_s: float = 5.0) -> None:
-    async with asyncio.timeout(timeout_s):
-        while not condition():  # noqa: ASYNC110 - what is waited for has no event
-            await asyncio.sleep(0.005)
 
 
 async def take(out: Events) -> tuple[str, str, str | None, str | None]:

@@ -5,13 +5,15 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import struct
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 
 import fake_nl80211 as fake
 import pytest
 from fake_nl80211 import ACCESS_POINT, FAMILY, STATION, FakeKernel
 from hypothesis import given
 from hypothesis import strategies as st
+from source_world import running
+from waiting import until
 
 from vad.devices.nl80211 import (
     Family,
@@ -96,24 +98,6 @@ def test_damaged_messages_give_values_or_a_typed_error(data: st.DataObject) -> N
 def test_any_bytes_give_values_or_a_typed_error(raw: bytes) -> None:
     with contextlib.suppress(ProtocolError):
         list(parse_datagram(raw, FAMILY))
-
-
-@contextlib.asynccontextmanager
-async def running(source: Nl80211Source, out: Events) -> AsyncIterator[None]:
-    task = asyncio.create_task(source.run(out))
-    try:
-        yield
-    finally:
-        assert not task.done(), task
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
-
-
-async def until(condition: Callable[[], bool], timeout_s: float = 5.0) -> None:
-    async with asyncio.timeout(timeout_s):
-        while not condition():  # noqa: ASYNC110 - what is waited for has no event
-            await asyncio.sleep(0.005)
 
 
 async def take(out: Events) -> tuple[str, str, str]:

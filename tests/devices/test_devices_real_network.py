@@ -18,6 +18,7 @@ from pathlib import Path
 
 import pytest
 from real_network import RealNetwork, why_not
+from waiting import until
 
 from vad.config import parse_settings
 from vad.daemon.adapters import join_sources
@@ -137,15 +138,6 @@ devices:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
-
-
-async def until(condition: Callable[[], bool], what: str, timeout_s: float = 20.0) -> None:
-    try:
-        async with asyncio.timeout(timeout_s):
-            while not condition():  # noqa: ASYNC110 - what is waited for has no event
-                await asyncio.sleep(0.002)
-    except TimeoutError:
-        raise AssertionError(f"not in {timeout_s:g} s: {what}") from None
 
 
 async def do(work: Callable[..., None], *arguments: object) -> None:

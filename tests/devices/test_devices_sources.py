@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import socket
 import time
-from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
 import pytest
+from source_world import running
+from waiting import until
 
 from vad.devices.hostapd_source import HostapdSource
 from vad.devices.static_list import StaticList
@@ -22,25 +22,6 @@ from vad.streams import DropOldestQueue
 Events = DropOldestQueue[StationEvent]
 
 A, B, C = "02:00:00:00:00:0a", "02:00:00:00:00:0b", "02:00:00:00:00:0c"
-
-
-@contextlib.asynccontextmanager
-async def running(part: HostapdEmulator | HostapdSource | StaticList, *out: Events) -> AsyncIterator[None]:
-    """The part runs inside, is cancelled and awaited at the end."""
-    task = asyncio.create_task(part.run(*out))  # type: ignore[arg-type]
-    try:
-        yield
-    finally:
-        assert not task.done(), task
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
-
-
-async def until(condition: Callable[[], bool], timeout_s: float = 5.0) -> None:
-    async with asyncio.timeout(timeout_s):
-        while not condition():  # noqa: ASYNC110 - what is waited for has no event
-            await asyncio.sleep(0.005)
 
 
 async def take(out: Events) -> tuple[str, str]:

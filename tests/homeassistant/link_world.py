@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -34,9 +34,3 @@ async def home_assistant(bus: Bus, folder: Path, port: int, **settings: Any) -> 
         task.cancel()
         await asyncio.wait({task})
         assert task.cancelled() or task.exception() is None, task.exception()
-
-
-async def until(condition: Callable[[], object], timeout_s: float = 40.0) -> None:
-    async with asyncio.timeout(timeout_s):
-        while not condition():  # noqa: ASYNC110 - health has no event
-            await asyncio.sleep(0.01)

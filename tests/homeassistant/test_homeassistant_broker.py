@@ -11,8 +11,9 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from link_world import TOPICS, closed_bus, home_assistant, until
-from mosquitto_world import Mosquitto, Watcher, free_port, needs_mosquitto, retained_at
+from link_world import TOPICS, closed_bus, home_assistant
+from mosquitto_world import Mosquitto, Watcher, needs_mosquitto, retained_at
+from waiting import free_port, until
 
 from vad.bus import messages as m
 from vad.bus.grid import grid_to_png

@@ -6,8 +6,9 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from link_world import TOPICS, closed_bus, home_assistant, until
+from link_world import TOPICS, closed_bus, home_assistant
 from mosquitto_world import Certificates, Mosquitto, Watcher, needs_mosquitto
+from waiting import until
 
 from vad.bus.node import Bus
 from vad.homeassistant import link

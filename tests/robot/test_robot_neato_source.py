@@ -11,12 +11,13 @@ import socket
 import threading
 import time
 import tty
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 import pytest
 import serial
 import serial.rfc2217
+from waiting import running, until
 
 from vad.robot.neato_source import NeatoSource
 from vad.robot.pose import RobotPose
@@ -24,26 +25,6 @@ from vad.sim.neato import Pose, VirtualNeato
 from vad.streams import DropOldestQueue
 
 Poses = DropOldestQueue[RobotPose]
-
-
-@contextlib.asynccontextmanager
-async def running(*parts: object) -> AsyncIterator[None]:
-    """The coroutines run inside, cancelled and awaited at the end."""
-    tasks = [asyncio.ensure_future(part) for part in parts]  # type: ignore[call-overload]
-    try:
-        yield
-    finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
-        failed = [t.exception() for t in tasks if not t.cancelled() and t.exception()]
-        assert not failed
-
-
-async def until(condition: Callable[[], bool], timeout_s: float = 5.0) -> None:
-    async with asyncio.timeout(timeout_s):
-        while not condition():  # noqa: ASYNC110 - what is waited for has no event
-            await asyncio.sleep(0.01)
 
 
 def circle(t_ns: int) -> Pose:
@@ -98,7 +79,7 @@ async def test_unplugged_and_plugged_in_again(tmp_path: Path, caplog: pytest.Log
             await take(out)
         assert not link.exists()
         # Long enough for the back-off to reach its end.
-        await until(lambda: _count(caplog, "no such port") >= 4, 8.0)
+        await until(lambda: _count(caplog, "no such port") >= 4, timeout_s=8.0)
         assert source.health.state == "degraded"
         assert _count(caplog, "no such port", logging.WARNING) == 1
         out.drain()
@@ -159,7 +140,7 @@ async def test_silence_is_noticed(raw_pty: tuple[int, str], noise: bytes, hint: 
     async with running(source.run(DropOldestQueue(1))):
         await until(lambda: source.health.counters["opened"] == 1)
         os.write(master, noise)
-        await until(lambda: source.health.state == "degraded", 4.0)
+        await until(lambda: source.health.state == "degraded", timeout_s=4.0)
         assert hint in source.health.detail
 
 

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import itertools
 import math
-from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from waiting import running, until
 
 from vad.robot.pose import RobotPose
 from vad.robot.roomba import (
@@ -132,24 +131,6 @@ def test_a_restarted_robot_is_lost_and_its_dock_finds_it() -> None:
     odometry.update(RoombaReading(45 * MS, 30_000, 0, False, True))
     assert not odometry.lost
     assert odometry.place == Odometry()
-
-
-@contextlib.asynccontextmanager
-async def running(*parts: object) -> AsyncIterator[None]:
-    tasks = [asyncio.ensure_future(part) for part in parts]  # type: ignore[call-overload]
-    try:
-        yield
-    finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
-        assert not [t.exception() for t in tasks if not t.cancelled() and t.exception()]
-
-
-async def until(condition: Callable[[], bool], timeout_s: float = 5.0) -> None:
-    async with asyncio.timeout(timeout_s):
-        while not condition():  # noqa: ASYNC110 - what is waited for has no event
-            await asyncio.sleep(0.01)
 
 
 async def take(out: DropOldestQueue[RobotPose]) -> RobotPose:

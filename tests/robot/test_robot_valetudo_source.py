@@ -6,11 +6,12 @@ import asyncio
 import contextlib
 import json
 import zlib
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 
 import pytest
 import zenoh
 from test_robot_valetudo import SMALL
+from waiting import until
 
 from vad.errors import ConfigError
 from vad.robot.pose import MapSource, RobotPose
@@ -36,12 +37,6 @@ async def running(source: ValetudoSource, out: Poses) -> AsyncIterator[None]:
 async def take(out: Poses, timeout_s: float = 5.0) -> RobotPose:
     async with asyncio.timeout(timeout_s):
         return await out.get()
-
-
-async def until(condition: Callable[[], bool], timeout_s: float = 5.0) -> None:
-    async with asyncio.timeout(timeout_s):
-        while not condition():  # noqa: ASYNC110 - what is waited for has no event
-            await asyncio.sleep(0.01)
 
 
 async def test_maps_and_poses_come_and_a_cut_connection_comes_back() -> None:

@@ -7,11 +7,12 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
+from waiting import until
 
 from vad.csi.connector import Connector
 from vad.csi.follow import FollowLog
@@ -27,12 +28,6 @@ from vad.sim.scenario import make_home
 from vad.streams import DropOldestQueue
 
 GROUP = 29  # not the driver's: other tests may play there at the same time
-
-
-async def until(condition: Callable[[], bool], timeout_s: float = 10.0) -> None:
-    async with asyncio.timeout(timeout_s):
-        while not condition():  # noqa: ASYNC110 - what is waited for has no event
-            await asyncio.sleep(0.005)
 
 
 def read_all(fd: int) -> bytes:

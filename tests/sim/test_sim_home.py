@@ -6,13 +6,14 @@ import asyncio
 import json
 import os
 import socket
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from waiting import until
 
 from vad.config import FollowCsi, MjpegCameraSettings, NeatoRobot, Settings, load_settings
 from vad.csi.attribution import Attribution
@@ -44,12 +45,6 @@ async def played(folder: Path, start_at_s: float = 0.0) -> AsyncIterator[Setting
         task.cancel()
         with suppress(asyncio.CancelledError):
             await task
-
-
-async def until(condition: Callable[[], bool]) -> None:
-    """Wait for what has no event."""
-    while not condition():  # noqa: ASYNC110
-        await asyncio.sleep(0.01)
 
 
 async def ask_robot(port: str) -> str:

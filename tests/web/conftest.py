@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from web_world import Serving, World, until, world
+from waiting import until
+from web_world import Serving, World, world
 
 
 @pytest.fixture

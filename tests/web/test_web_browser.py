@@ -10,7 +10,8 @@ from pathlib import Path
 import msgspec
 import pytest
 import pytest_asyncio
-from web_world import PLAN, Serving, World, device, heatmap, mac, status, until
+from waiting import until
+from web_world import PLAN, Serving, World, device, heatmap, mac, status
 
 from vad.bus import messages as m
 from vad.web.home import Robot

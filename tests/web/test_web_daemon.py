@@ -9,12 +9,13 @@ import sys
 from pathlib import Path
 
 import pytest
+from waiting import free_port, until
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "daemon"))
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
 
 from bench_web_browser import Browser, chromium
-from daemon_world import Vad, change_settings, free_port, store_calibration, until
+from daemon_world import Vad, change_settings, store_calibration
 
 from vad.sim.scenario import make_home
 from vad.web.access import write_token

@@ -12,7 +12,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from web_world import PLAN, Serving, World, device, mac, until, world
+from waiting import until
+from web_world import PLAN, Serving, World, device, mac, world
 
 from vad.bus import messages as m
 from vad.web import server as server_module

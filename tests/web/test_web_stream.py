@@ -11,7 +11,8 @@ from pathlib import Path
 import aiohttp
 import msgspec
 import pytest
-from web_world import Event, Serving, World, device, events, mac, status, until, world
+from waiting import until
+from web_world import Event, Serving, World, device, events, mac, status, world
 
 from vad.bus import messages as m
 from vad.web import stream as stream_module
