@@ -139,11 +139,13 @@ async def test_only_what_is_wanted_is_decoded() -> None:
     device = Device(monotonic_ms)
     out = FrameQueue(1000)
     out.step_ns = 50_000_000
-    task = asyncio.create_task(V4l2Camera(V4l2Settings("/dev/video9"), opener=device.open).run(out))
+    camera = V4l2Camera(V4l2Settings("/dev/video9"), opener=device.open)
+    task = asyncio.create_task(camera.run(out))
     await until(lambda: len(out) >= 6)
     times = [frame.t_ns for frame in out.drain()]
     assert min(b - a for a, b in itertools.pairwise(times)) >= out.step_ns
     assert device.decoded <= len(times) + 1
+    assert camera.health.counters["unwanted"] > len(times)
     out.step_ns = 0
     await until(lambda: len(out) >= 6)
     task.cancel()

@@ -28,16 +28,19 @@ class FrameQueue(DropOldestQueue[Frame]):
 
     Attributes:
         step_ns: the consumer's: pictures that come sooner than this after the last one wanted are left out.
+        unwanted: how many were.
     """
 
     def __init__(self, maxsize: int) -> None:
         super().__init__(maxsize)
         self.step_ns = 0
+        self.unwanted = 0
         self._wanted_ns: int | None = None
 
     def wants(self, t_ns: int) -> bool:
         """Whether to decode and put the picture of t_ns. For the camera alone, in any one thread, in turn."""
         if self._wanted_ns is not None and 0 <= t_ns - self._wanted_ns < self.step_ns:
+            self.unwanted += 1
             return False
         self._wanted_ns = t_ns
         return True

@@ -147,6 +147,7 @@ class HttpStreamCamera:
         while True:
             t_ns, jpeg = await waiting.get()
             if not out.wants(t_ns):
+                self.health.counters["unwanted"] = out.unwanted
                 continue
             image = await loop.run_in_executor(pool, decode_jpeg, jpeg)
             if image is None:

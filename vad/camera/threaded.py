@@ -63,6 +63,7 @@ async def run_reopening(
         health.counters["frames"] += 1
         health.counters["dropped"] += out.dropped - before
         health.counters.update(shot.counts)
+        health.counters["unwanted"] = out.unwanted
         health.ok(shot.detail)
 
     def trouble(reason: str) -> None:
