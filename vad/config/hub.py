@@ -88,7 +88,7 @@ class VisionSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     robot_detector: motion finds the robot by its driving, packaged by the network that comes along, a path
         by a YOLOv5, YOLOv8 or YOLOX as ONNX
     robot_class: its class there, by name or number, if it has several
-    max_fps: pictures a second that are looked at; one walker at 15 takes 40 % of a core, an idle room 3 %
+    max_fps: pictures a second that are looked at; one walker at 15 takes 40 % of a core, an idle room 2 %
     threads: of the network
     """
 
