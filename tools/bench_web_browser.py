@@ -248,7 +248,8 @@ class Page:
             raise BrowserError(f"not in {timeout_s:.0f} s: {script}; problems: {self.problems}") from None
 
     async def click(self, selector: str) -> None:
-        """Press the pointer in the middle of what the CSS selector finds."""
+        """Press the pointer in the middle of what the CSS selector finds, once it is there to be pressed."""
+        await self.until(f"document.querySelector({json.dumps(selector)}).checkVisibility()")
         x, y = await self.value(
             f"(() => {{ const node = document.querySelector({json.dumps(selector)});"
             " node.scrollIntoView({block: 'nearest'}); const box = node.getBoundingClientRect();"

@@ -15,9 +15,11 @@ from typing import Any, Self
 
 import msgspec
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "web"))
 
-from web_world import World, device, until, world
+from waiting import until
+from web_world import World, device, world
 
 from vad.web.home import Robot
 

@@ -80,7 +80,8 @@ def test_it_answers_and_says_what_is_missing(folder: Path, report: dict[str, str
     parts = {part["part"]: part for part in status["parts"]}
     robot = next(part for name, part in parts.items() if "neato" in name or "robot" in name)
     assert robot["state"] != "ok"
-    assert "/dev/ttyACM0" in robot["detail"]
+    assert robot["part"].endswith("/dev/ttyACM0")
+    assert "no such port" in robot["detail"]
     assert "robot" in status["step"]
 
 

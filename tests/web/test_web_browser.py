@@ -14,6 +14,7 @@ from waiting import until
 from web_world import PLAN, Serving, World, device, heatmap, mac, status
 
 from vad.bus import messages as m
+from vad.bus.plan import map_message
 from vad.web.home import Robot
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
@@ -125,9 +126,7 @@ async def test_changes_appear_by_themselves(serving: Serving, browser: Browser) 
 
 
 def plan_of(made: World) -> m.MapMessage:
-    from web_world import plan_message
-
-    return plan_message(PLAN)
+    return map_message(PLAN, "simulated")
 
 
 async def test_a_click_shows_the_heatmap_and_who_it_is(serving: Serving, browser: Browser) -> None:
