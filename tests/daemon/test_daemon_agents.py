@@ -5,15 +5,12 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections.abc import AsyncIterator, Coroutine
-from contextlib import asynccontextmanager, suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from daemon_world import settings_for
-from waiting import free_port, until
+from waiting import free_port, running, until
 
 from vad.agent.info import AgentInfo
 from vad.agent.node import Node
@@ -40,20 +37,6 @@ HOME = make_home(1)
 NODE_MAC = HOME.device_mac
 WALK = HOME.walks[0]
 S = 1_000_000_000
-
-
-@asynccontextmanager
-async def meanwhile(*works: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
-    """Tasks that run meanwhile."""
-    tasks = [asyncio.create_task(work) for work in works]
-    try:
-        yield
-    finally:
-        for task in tasks:
-            task.cancel()
-        for task in tasks:
-            with suppress(asyncio.CancelledError):
-                await task
 
 
 async def film(frames: FrameQueue, renderer: Renderer, start_ns: int) -> None:
@@ -96,10 +79,10 @@ async def test_a_walk_past_a_remote_card_places_it(tmp_path: Path) -> None:
             buffer_bytes=32_000_000,
         )
         await registry.joined(NODE_MAC, "attic")
-        async with meanwhile(eyes.run(frames), agents.run(bus.session), captures.run(), node.run()):
+        async with running(eyes.run(frames), agents.run(bus.session), captures.run(), node.run()):
             await until(lambda: agents.card_of(NODE_MAC) is not None, "the agent is there")
             start_ns = time.monotonic_ns() - int((WALK.start_s + 2.0) * S)
-            async with meanwhile(film(frames, renderer, start_ns), run(radio, start_ns, sender)):
+            async with running(film(frames, renderer, start_ns), run(radio, start_ns, sender)):
                 await until(lambda: registry.get(NODE_MAC).state == "capturing", "a walker is seen", 20)
                 await until(lambda: registry.get(NODE_MAC).walks == 1, "the walk is solved", 30)
         place = registry.get(NODE_MAC).estimate

@@ -36,7 +36,7 @@ class Wishes:
         self, keys: HubKeys, registry: Registry, source: m.Source, *, patience_s: float = PATIENCE_S
     ) -> None:
         self._patience_s = patience_s
-        self._waiting: set[asyncio.Task[str]] = set()
+        self._granting: set[asyncio.Task[str]] = set()
         self._keys = keys
         self._registry = registry
         self._source = source
@@ -61,9 +61,9 @@ class Wishes:
                 # in a thread: an asker that does not read must not stop the loop
                 await asyncio.to_thread(partial(_send, query, self._keys.wishes, reply))
         finally:
-            for waiting in self._waiting:
-                waiting.cancel()
-            await asyncio.gather(*self._waiting, return_exceptions=True)
+            for granting in self._granting:
+                granting.cancel()
+            await asyncio.gather(*self._granting, return_exceptions=True)
             # The session may be closed already.
             with contextlib.suppress(zenoh.ZError):
                 queryable.undeclare()  # type: ignore[no-untyped-call]
@@ -95,25 +95,17 @@ class Wishes:
     async def _patiently(self, wish: m.DeviceWish) -> str:
         """`_grant` for as long as a client waits; TimeoutError where it goes on after that."""
         granting = asyncio.create_task(self._grant(wish), name="wish")
+        self._granting.add(granting)
+        granting.add_done_callback(self._granting.discard)
         try:
             async with asyncio.timeout(self._patience_s):
                 return await asyncio.shield(granting)
         except TimeoutError:
-            self._waiting.add(granting)
-            granting.add_done_callback(self._granted_late)
+            granting.add_done_callback(_say_late)
             raise
         except asyncio.CancelledError:
             granting.cancel()
             raise
-
-    def _granted_late(self, wish: asyncio.Task[str]) -> None:
-        self._waiting.discard(wish)
-        if wish.cancelled():
-            _log.warning("a wish was given up: it could not be kept")
-        elif error := wish.exception():
-            _log.warning("a wish came to nothing: %s", error)
-        else:
-            _log.info("%s", wish.result())
 
     async def _grant(self, wish: m.DeviceWish) -> str:
         """Do what is wanted; one sentence of what became of it. VadError where it cannot be."""
@@ -148,6 +140,16 @@ class Wishes:
             for device in table.all()
             if table.ignores(device)
         )
+
+
+def _say_late(wish: asyncio.Task[str]) -> None:
+    """What became of a wish whose asker has gone."""
+    if wish.cancelled():
+        _log.warning("a wish was given up: it could not be kept")
+    elif error := wish.exception():
+        _log.warning("a wish came to nothing: %s", error)
+    else:
+        _log.info("%s", wish.result())
 
 
 def _send(query: zenoh.Query, key: str, reply: m.WishReply | m.ErrorMessage) -> None:
