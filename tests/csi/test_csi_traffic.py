@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import os
 import shutil
+import socket
 import subprocess
 import sys
+import time
 from collections.abc import AsyncIterator, Iterator
 from dataclasses import dataclass
 
@@ -53,6 +56,19 @@ def ip(*words: str) -> None:
     subprocess.run(["ip", *words], check=True, capture_output=True, timeout=10)
 
 
+def wait_until_it_carries(address: str) -> None:
+    """Until packets go there and back: the kernel turns a new cable's queues on when it has time, and asks a
+    second later for the hardware address of a device whose answer was dropped before that."""
+    until_s = time.monotonic() + 20.0
+    while time.monotonic() < until_s:
+        with socket.socket() as probe:
+            probe.settimeout(1.0)
+            with contextlib.suppress(OSError):
+                if probe.connect_ex((address, 9)) == errno.ECONNREFUSED:
+                    return
+    raise AssertionError(f"the cable to {address} does not carry")
+
+
 @pytest.fixture
 def peer() -> Iterator[Peer]:
     if os.geteuid() != 0 or shutil.which("ip") is None:
@@ -71,6 +87,7 @@ def peer() -> Iterator[Peer]:
         ip("link", "set", made.interface, "up")
         ip("-n", made.namespace, "addr", "add", f"{made.address}/24", "dev", "eth0")
         ip("-n", made.namespace, "link", "set", "eth0", "up")
+        wait_until_it_carries(made.address)
         yield made
     finally:
         ip("netns", "del", made.namespace)
