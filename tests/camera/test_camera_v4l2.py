@@ -13,9 +13,11 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from camera_world import running
 from waiting import until
 
 from vad.camera.frame import FrameQueue
+from vad.camera.opencv_capture import BAD_IN_A_ROW
 from vad.camera.v4l2 import V4l2Camera, V4l2Settings, open_v4l2
 from vad.errors import SourceError
 
@@ -30,6 +32,7 @@ class Device:
         self.settings: list[tuple[int, float]] = []
         self.open_handles = 0
         self.decoded = 0
+        self.is_damaged: Callable[[int], bool] = lambda number: False
 
     def open(self, device: str) -> Handle:
         if not self.plugged.is_set():
@@ -52,6 +55,8 @@ class Handle:
 
     def retrieve(self) -> tuple[bool, Any]:
         self.device.decoded += 1
+        if self.device.is_damaged(self.device.decoded):
+            return False, None
         return True, np.full((48, 64, 3), 9, np.uint8)
 
     def get(self, prop: int, /) -> float:
@@ -150,6 +155,29 @@ async def test_only_what_is_wanted_is_decoded() -> None:
     await until(lambda: len(out) >= 6)
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
+
+
+async def test_damaged_pictures_are_left_out_and_said_once(caplog: pytest.LogCaptureFixture) -> None:
+    device = Device(monotonic_ms)
+    device.is_damaged = lambda number: number % 3 > 0
+    camera = V4l2Camera(V4l2Settings("/dev/video9"), opener=device.open)
+    async with running(camera) as out:
+        await until(lambda: len(out) >= 5)
+        counters = camera.health.counters
+        assert counters["bad_pictures"] == 2 * counters["frames"]
+        assert (camera.health.state, counters["reopens"]) == ("ok", 0)
+    assert [r.levelname for r in caplog.records].count("WARNING") == 1
+
+
+async def test_a_camera_whose_pictures_are_all_damaged_is_opened_anew() -> None:
+    device = Device(monotonic_ms)
+    device.is_damaged = lambda number: number <= BAD_IN_A_ROW
+    camera = V4l2Camera(V4l2Settings("/dev/video9"), opener=device.open)
+    async with running(camera) as out:
+        await until(lambda: "cannot be decoded" in camera.health.last_error)
+        await until(lambda: len(out))
+        assert camera.health.state == "ok"
+    assert device.open_handles == 0
 
 
 async def test_absent_device_is_trouble_not_the_end(tmp_path: Path) -> None:

@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 from vad.health import Health
 from vad.streams import DropOldestQueue
 
+BAD_PICTURES = "bad_pictures"
+"""A camera's counter of the pictures that could not be decoded: left out, said once."""
+
 
 @dataclass(frozen=True, slots=True)
 class Frame:

@@ -12,7 +12,7 @@ from urllib.parse import unquote, urlsplit
 import cv2
 import numpy as np
 
-from vad.camera.frame import Frame, FrameQueue
+from vad.camera.frame import BAD_PICTURES, Frame, FrameQueue
 from vad.camera.mjpeg import (
     MAX_HEAD_BYTES,
     ChunkedDecoder,
@@ -151,8 +151,8 @@ class HttpStreamCamera:
                 continue
             image = await loop.run_in_executor(pool, decode_jpeg, jpeg)
             if image is None:
-                self.health.counters["bad_pictures"] += 1
-                if self.health.counters["bad_pictures"] == 1:
+                self.health.counters[BAD_PICTURES] += 1
+                if self.health.counters[BAD_PICTURES] == 1:
                     log.warning("%s: a picture of %d bytes cannot be decoded", self.health.part, len(jpeg))
                 continue
             out.put(Frame(t_ns, self._seq, image))

@@ -16,7 +16,7 @@ import usb.util
 from numpy.typing import NDArray
 
 from vad.camera import kinect2
-from vad.camera.frame import FrameQueue
+from vad.camera.frame import BAD_PICTURES, FrameQueue
 from vad.camera.threaded import Emit, Shot, Wants, run_reopening
 from vad.clock import ClockMap
 from vad.errors import SourceError
@@ -257,7 +257,7 @@ class _Decoder:
                 counts, self._counts = self._counts, {}
             image = _decode(jpeg, self._flag)
             if image is None:
-                self.count("bad_pictures", 1)
+                self.count(BAD_PICTURES, 1)
                 for what, number in counts.items():
                     self.count(what, number)
                 continue

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import os
 import threading
-import time
 from collections.abc import Callable
-from typing import Any, Literal, Protocol
+from typing import Literal
 from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
 
-from vad.camera.frame import FrameQueue
+from vad.camera.frame import BAD_PICTURES, FrameQueue
+from vad.camera.opencv_capture import Capture, Grabber
 from vad.camera.threaded import Emit, Shot, Wants, run_reopening
 from vad.clock import ClockMap
 from vad.errors import ConfigError, SourceError
@@ -27,16 +27,6 @@ _END_S = 4.5
 _FFMPEG_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 _FFMPEG_LOG_LEVEL = "OPENCV_FFMPEG_LOGLEVEL"
 _FATAL_ONLY = "8"
-
-
-class Capture(Protocol):
-    """What is used of cv2.VideoCapture."""
-
-    def isOpened(self) -> bool: ...  # noqa: N802
-    def grab(self) -> bool: ...
-    def retrieve(self) -> tuple[bool, Any]: ...
-    def get(self, prop: int, /) -> float: ...
-    def release(self) -> None: ...
 
 
 class RtspCamera:
@@ -84,29 +74,30 @@ class RtspCamera:
     def _session(self, stop: threading.Event, emit: Emit, wants: Wants) -> None:
         capture = self._opener(self._url, self._transport)
         clock, restarts = ClockMap(), 0
+        grabber, bad = Grabber(capture, self._where), 0
         try:
             if not capture.isOpened():
                 remedy = "see whether it is on, and whether the path, user and password are right"
                 raise SourceError("the camera cannot be opened", where=self._where, remedy=remedy)
             while not stop.is_set():
-                good = capture.grab()
-                arrival_ns = time.monotonic_ns()
-                if not good:
-                    raise SourceError("the camera has stopped sending", where=self._where)
+                arrival_ns = grabber.grab()
                 since_start_us = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e3)
                 counter = np.array([since_start_us & 0xFFFFFFFF], np.uint32)
                 t_ns = int(clock.update(counter, np.array([arrival_ns], np.int64))[0])
                 t_ns = min(t_ns, arrival_ns)
                 if not wants(t_ns):
                     continue
-                good, image = capture.retrieve()
-                if not good or image is None:
-                    raise SourceError("the camera has stopped sending", where=self._where)
-                picture = np.asarray(image, dtype=np.uint8)
+                picture = grabber.decode()
+                if picture is None:
+                    continue
                 height, width = picture.shape[:2]
                 stamps = "arrival" if clock.still else "stream"
-                counts = {"arrival_stamps": int(clock.still), "clock_restarts": clock.restarts - restarts}
-                restarts = clock.restarts
+                counts = {
+                    "arrival_stamps": int(clock.still),
+                    "clock_restarts": clock.restarts - restarts,
+                    BAD_PICTURES: grabber.bad - bad,
+                }
+                restarts, bad = clock.restarts, grabber.bad
                 emit(Shot(t_ns, picture, f"{width}x{height}, stamps: {stamps}", counts))
         finally:
             capture.release()

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vad.camera.frame import Frame, FrameQueue
+from vad.camera.frame import BAD_PICTURES, Frame, FrameQueue
 from vad.errors import ProtocolError, SourceError
 from vad.health import Health
 
@@ -62,6 +62,8 @@ async def run_reopening(
         seq += 1
         health.counters["frames"] += 1
         health.counters["dropped"] += out.dropped - before
+        if shot.counts.get(BAD_PICTURES) and not health.counters[BAD_PICTURES]:
+            log.warning("%s: a picture cannot be decoded; it and the next such are left out", health.part)
         health.counters.update(shot.counts)
         health.counters["unwanted"] = out.unwanted
         health.ok(shot.detail)

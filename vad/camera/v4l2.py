@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import os
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
 
 import cv2
-import numpy as np
 
-from vad.camera.frame import FrameQueue
+from vad.camera.frame import BAD_PICTURES, FrameQueue
+from vad.camera.opencv_capture import Capture, Grabber
 from vad.camera.stamps import is_plausible
 from vad.camera.threaded import Emit, Shot, Wants, run_reopening
 from vad.errors import SourceError
@@ -24,17 +22,6 @@ _SELECT_TIMEOUT_S = 1
 _SELECT_TIMEOUT_VARIABLE = "OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT"
 # Of a trusted driver: on a busy machine its pictures may wait in its buffers for as long as this.
 _OLDEST_TRUSTED_NS = 30_000_000_000
-
-
-class Capture(Protocol):
-    """What is used of cv2.VideoCapture."""
-
-    def isOpened(self) -> bool: ...  # noqa: N802
-    def grab(self) -> bool: ...
-    def retrieve(self) -> tuple[bool, Any]: ...
-    def get(self, prop: int, /) -> float: ...
-    def set(self, prop: int, value: float, /) -> bool: ...
-    def release(self) -> None: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,11 +79,9 @@ class V4l2Camera:
             capture.set(cv2.CAP_PROP_FRAME_HEIGHT, wanted.height_px)
             capture.set(cv2.CAP_PROP_FPS, wanted.fps)
             fourcc, stamps, last_ns = _format(capture), _DriverClock(), 0
+            grabber, bad = Grabber(capture, wanted.device), 0
             while not stop.is_set():
-                good = capture.grab()
-                arrival_ns = time.monotonic_ns()
-                if not good:
-                    raise SourceError("the camera has stopped sending", where=wanted.device)
+                arrival_ns = grabber.grab()
                 driver_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
                 t_ns, trusted = stamps.stamp(driver_ns, arrival_ns)
                 if t_ns <= last_ns:  # the clocks were mixed for a moment; time does not go back
@@ -104,13 +89,20 @@ class V4l2Camera:
                 last_ns = t_ns
                 if not wants(t_ns):
                     continue
-                good, image = capture.retrieve()
-                if not good or image is None:
-                    raise SourceError("the camera has stopped sending", where=wanted.device)
-                picture = np.asarray(image, dtype=np.uint8)
+                picture = grabber.decode()
+                if picture is None:
+                    continue
                 height, width = picture.shape[:2]
                 detail = f"{width}x{height} {fourcc}, stamps: {'driver' if trusted else 'arrival'}"
-                emit(Shot(t_ns, picture, detail, {"arrival_stamps": not trusted}))
+                emit(
+                    Shot(
+                        t_ns,
+                        picture,
+                        detail,
+                        {"arrival_stamps": not trusted, BAD_PICTURES: grabber.bad - bad},
+                    )
+                )
+                bad = grabber.bad
         finally:
             capture.release()
 
