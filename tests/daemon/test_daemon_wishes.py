@@ -21,7 +21,7 @@ from vad.bus.session import BusSettings
 from vad.client import QueryError, VadClient
 from vad.commands.device import device_app
 from vad.daemon.registry import Registry
-from vad.daemon.wishes import MAX_BYTES, Wishes
+from vad.daemon.wishes import MAX_BYTES, WAITING_AT_MOST, Wishes
 from vad.sim.home import floor_plan
 from vad.sim.scenario import make_home
 from vad.store.worker import StoreWorker
@@ -33,16 +33,19 @@ PLAN = floor_plan(make_home(1))
 class Home:
     """A hub with a lamp and a TV; the settings name the TV and ignore the phone."""
 
-    def __init__(self, endpoint: str, wishes: asyncio.Task[None] | None = None) -> None:
+    def __init__(
+        self, endpoint: str, wishes: Wishes | None = None, answering: asyncio.Task[None] | None = None
+    ) -> None:
         self._endpoint = endpoint
-        self._wishes = wishes
+        self._answering = answering
+        self.wishes = wishes
 
     async def end(self) -> None:
         """Grant no more wishes, as a daemon that stops."""
-        if self._wishes is not None:
-            self._wishes.cancel()
+        if self._answering is not None:
+            self._answering.cancel()
             with contextlib.suppress(asyncio.CancelledError):
-                await self._wishes
+                await self._answering
 
     async def vad_device(self, *arguments: str, code: int = 0) -> str:
         """What the command says."""
@@ -85,7 +88,7 @@ async def home(folder: Path) -> AsyncIterator[Home]:
         for mac, name in ((LAMP, "ESP_1234"), (TV, None), (PHONE, "phone")):
             await registry.joined(mac, name)
         wish = Wishes(bus.keys, registry, "simulated", patience_s=1.0)
-        there = Home(endpoint, asyncio.create_task(wish.run(bus.session)))
+        there = Home(endpoint, wish, asyncio.create_task(wish.run(bus.session)))
         try:
             yield there
         finally:
@@ -141,11 +144,27 @@ async def test_what_cannot_be_kept_now_waits_and_says_so(tmp_path: Path) -> None
                 await asyncio.sleep(0.05)
 
 
-async def test_a_wish_that_waits_does_not_keep_the_daemon(tmp_path: Path) -> None:
+async def test_no_more_wishes_wait_than_the_memory_takes(tmp_path: Path) -> None:
     async with home(tmp_path) as there:
+        assert there.wishes is not None
+        wish = m.encode(m.DeviceWish(mac=LAMP, name="lamp"))
         with disk_full(tmp_path):
+            said = await asyncio.gather(*(there.wishes.answer(wish) for _ in range(WAITING_AT_MOST)))
+            assert [one.code for one in said if isinstance(one, m.ErrorMessage)] == ["waiting"] * len(said)
+            refused = await there.wishes.answer(wish)
+            assert isinstance(refused, m.ErrorMessage)
+            assert refused.code == "busy"
+        async with asyncio.timeout(20.0):
+            while isinstance(await there.wishes.answer(wish), m.ErrorMessage):  # noqa: ASYNC110 - see above
+                await asyncio.sleep(0.05)
+        assert (await there.devices())[LAMP] == "lamp"
+
+
+async def test_a_wish_that_waits_does_not_keep_the_daemon(tmp_path: Path) -> None:
+    with contextlib.ExitStack() as until_the_end:
+        async with home(tmp_path) as there:
+            until_the_end.enter_context(disk_full(tmp_path))
             assert "waits to be kept" in await there.vad_device("rename", LAMP, "lamp", code=2)
-            await there.end()
     async with home(tmp_path) as there:
         assert (await there.devices())[LAMP] == "ESP_1234"
 

@@ -21,6 +21,8 @@ from vad.wall import now_rfc3339
 MAX_BYTES = 4096
 PATIENCE_S = 3.0
 """Less than a client's: who asks is told that it waits (for a disk that is full), not that nobody answers."""
+WAITING_AT_MOST = 32
+"""Wishes that wait to be kept: more are refused, so that a full disk does not fill the memory too."""
 _INBOX = 64
 
 _log = logging.getLogger(__name__)
@@ -72,6 +74,9 @@ class Wishes:
         """Grant a DeviceWish in JSON: what became of it, or why it cannot be."""
         if len(payload) > MAX_BYTES:
             return m.ErrorMessage(code="bad_wish", text="The wish is too long")
+        if len(self._granting) >= WAITING_AT_MOST:
+            text = f"{len(self._granting)} wishes wait to be kept: see what the store says in `vad status`"
+            return m.ErrorMessage(code="busy", text=text)
         try:
             wish = m.decode(payload, m.DeviceWish)
             text = await self._patiently(wish)
