@@ -28,12 +28,13 @@ import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 from bench_idle_home import still_and_moving
+from bench_soak_month import Midnight, Month, nights_table, rss_mb
 from bench_week_sim import Simulation, Week, _Bus, settings_for
 from rich.console import Console
 from rich.table import Table
@@ -59,79 +60,10 @@ from vad.store.store import Store
 from vad.streams import DropOldestQueue
 from vad.vision.people import PoseNetwork
 
-GROWTH_BAR = 0.05
-WARM_SHARE, WARM_DAYS = 0.2, 6
-"""Caches fill and threads start in the first days, however long it goes on."""
-SLACK = {"descriptors": 4, "threads": 6, "tasks": 2}
-"""The solver's process comes and goes with its pipes, zenoh's threads do, and asyncio's pool fills."""
 LEAVES_H, RETURNS_H = 8.5, 17.5
 GUEST_H = (18.0, 20.0)
 PICTURES, MOVING, BATCHES, STATUSES, POSES = 90, 45, 100, 100, 500
 """Of each of these a day."""
-
-
-@dataclass(frozen=True, slots=True)
-class Midnight:
-    """What was counted at the end of a day. rss_mb, threads, descriptors, tasks: of the process; solver_mb:
-    of the solver's, 0 while there is none; store_kb, sessions_mb: on the disk."""
-
-    day: int
-    rss_mb: float
-    descriptors: int
-    threads: int
-    tasks: int
-    solver_mb: float
-    store_kb: int
-    sessions_mb: float
-    devices: int
-    solved: int
-    asked: int
-
-
-@dataclass(slots=True)
-class Month:
-    """The whole time. lost: devices that are known no more, and answers that lacked one."""
-
-    seconds: float = 0.0
-    nights: list[Midnight] = field(default_factory=list)
-    lost: list[str] = field(default_factory=list)
-    walks: int = 0
-    removed: int = 0
-
-    @property
-    def warm(self) -> Midnight:
-        """The end of the warm-up."""
-        days = max(WARM_DAYS, round(len(self.nights) * WARM_SHARE))
-        return self.nights[min(days, len(self.nights)) - 1]
-
-    @property
-    def after(self) -> list[Midnight]:
-        """All nights from there on."""
-        return self.nights[self.nights.index(self.warm) :]
-
-    def rows(self) -> list[tuple[str, str, str, bool | None]]:
-        """What, figure, bar, whether it is kept."""
-        after, warm = self.after, self.warm
-        growth = max(night.rss_mb for night in after) / warm.rss_mb - 1.0
-        rows: list[tuple[str, str, str, bool | None]] = [
-            ("days simulated", f"{len(self.nights)} in {self.seconds:.0f} s", "", None),
-            ("walks, sessions solved", f"{self.walks}, {self.nights[-1].solved}", "", None),
-            ("sessions deleted by the quota", str(self.removed), "", None),
-            ("questions asked", str(self.nights[-1].asked), "", None),
-            ("devices at the end", str(self.nights[-1].devices), "", None),
-            ("memory after warm-up", f"{warm.rss_mb:.0f} MB, {growth:+.1%}", "<= +5 %", growth <= GROWTH_BAR),
-        ]
-        for name in ("descriptors", "threads", "tasks"):
-            counts = [getattr(night, name) for night in after]
-            told = f"{min(counts)} to {max(counts)}" if min(counts) != max(counts) else str(counts[0])
-            rows.append((name, told, f"+{SLACK[name]} at most", max(counts) <= counts[0] + SLACK[name]))
-        rows.append(("devices lost", str(len(self.lost)), "0", not self.lost))
-        return rows
-
-    @property
-    def kept(self) -> bool:
-        """Whether every bar is kept."""
-        return all(good is not False for *_, good in self.rows())
 
 
 class LiveBus(_Bus):
@@ -309,11 +241,11 @@ class Soak(Simulation):
         self.month.nights.append(
             Midnight(
                 len(self.month.nights) + 1,
-                _rss_mb(os.getpid()),
+                rss_mb(os.getpid()),
                 len(list(Path("/proc/self/fd").iterdir())),
                 len(list(Path("/proc/self/task").iterdir())),
                 len(asyncio.all_tasks()),
-                _rss_mb(self._solver.pid) if self._solver.pid else 0.0,
+                rss_mb(self._solver.pid) if self._solver.pid else 0.0,
                 sum(path.stat().st_size for path in self._folder.glob("vad.sqlite*")) // 1000,
                 sessions / 1e6,
                 len(self._registry.all()),
@@ -336,13 +268,6 @@ def _of_a_stranger(batch: CsiBatch, number: int) -> CsiBatch:
     return CsiBatch(replace(some, mac=stranger, arrival_ns=arrivals), b"", np.zeros(len(some), np.int64))
 
 
-def _rss_mb(pid: int) -> float:
-    try:
-        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
-    except OSError:
-        return 0.0
-
-
 def soak(
     days: int, walks: int, devices: int, seed: int, on_night: Callable[[Midnight], None] = lambda _night: None
 ) -> Month:
@@ -362,29 +287,6 @@ def soak(
         joined = {device.mac for device in house.devices if device.mac in simulation.week.records}
         month.lost += [f"{mac} is not in the store" for mac in sorted(joined - kept)]
     return month
-
-
-def nights_table(nights: list[Midnight]) -> Table:
-    """Each midnight."""
-    table = Table(box=None)
-    names = (
-        "day",
-        "RSS MB",
-        "descriptors",
-        "threads",
-        "tasks",
-        "solver MB",
-        "store kB",
-        "sessions MB",
-        "devices",
-    )
-    for name in (*names, "solved", "asked"):
-        table.add_column(name, justify="right")
-    for night in nights:
-        table.add_row(
-            *(f"{value:.1f}" if isinstance(value, float) else str(value) for value in asdict(night).values())
-        )
-    return table
 
 
 def main() -> None:
