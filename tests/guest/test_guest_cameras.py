@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from guest_world import Guest
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(3000)]
 
 FRAMES = 12
 
@@ -26,7 +26,7 @@ def report(guest: Guest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
         if file.is_file():
             shutil.copy(file, folder)
     subprocess.run([sys.executable, str(folder / "pictures.py"), str(folder)], check=True)
-    done = guest(folder, timeout_s=1200)
+    done = guest(folder, timeout_s=2400)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     found: dict[str, Any] = json.loads((folder / "report.json").read_text())
     return found

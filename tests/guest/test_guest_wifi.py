@@ -10,10 +10,11 @@ from typing import Any
 import pytest
 from guest_world import Guest
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500)]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(3000)]
 
-SOON_S = 2.0
-"""A guest's Python is some ten times slower than a hub's."""
+SOON_S = 20.0
+"""Of that ASK_LAST_S is vad's own; a guest's Python is some ten times slower than a hub's, on a host that is
+idle. Without the answer to its question the kernel's source would not tell of a station at all."""
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +24,7 @@ def report(guest: Guest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
     for file in (Path(__file__).parent / "wifi").iterdir():
         if file.is_file():
             shutil.copy(file, folder)
-    done = guest(folder)
+    done = guest(folder, timeout_s=2400)
     logs = "".join(log.read_text()[-2000:] for log in sorted(folder.glob("*.log")))
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:] + logs
     found: dict[str, Any] = json.loads((folder / "report.json").read_text())
