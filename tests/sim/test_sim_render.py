@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
+from effort import effort
 
 from vad.geometry import project
 from vad.sim.render import Renderer
@@ -119,12 +119,8 @@ def test_furniture_hides_who_stands_behind_it() -> None:
     assert np.abs(a[patch].astype(int) - b[patch]).max() < 30
 
 
-def test_a_frame_takes_no_more_than_15_ms() -> None:
+def test_a_frame_costs_little() -> None:
     scenario, renderer = home(1)
     walk = scenario.walks[0]
-    spent = []
-    for t_s in np.linspace(walk.start_s, walk.end_s, 40):
-        start = time.thread_time()
-        renderer.frame(float(t_s))
-        spent.append(time.thread_time() - start)
-    assert np.median(spent) < 0.015
+    times_s = np.linspace(walk.start_s, walk.end_s, 40)
+    assert effort(*(partial(renderer.frame, float(t_s)) for t_s in times_s)) < 5

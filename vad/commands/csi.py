@@ -148,7 +148,9 @@ def play(
         sender = driver.ConnectorSender(group) if fifo is None else driver.FifoSender(fifo)
     end_s = player.length_s + driver.TICK_S * speed
     start_ns = time.monotonic_ns() + int(driver.AHEAD_S * 1e9)
-    asyncio.run(until_ended(driver.run(player, start_ns, sender, speed=speed, until_s=end_s)))
+    # From its first record, however long it takes to get there: what is then too late is told.
+    playing = driver.run(player, start_ns, sender, speed=speed, from_s=0.0, until_s=end_s)
+    asyncio.run(until_ended(playing))
     counters = sender.health.counters
     missed = counters["dropped_records"] + counters["late_records"]
     told = f", {missed:,} not sent: {sender.health.detail or 'too late'}" if missed else ""

@@ -236,6 +236,7 @@ async def run(
     sender: Sender,
     *,
     speed: float = 1.0,
+    from_s: float | None = None,
     until_s: float | None = None,
 ) -> None:
     """Play the radio until cancelled, or until all of it before `until_s` is sent; closes the sender.
@@ -247,6 +248,7 @@ async def run(
             sent but counted in `sender.health.counters["late_records"]` (made but too late) and
             `["skipped_ms"]` (of the radio's time; not even made).
         speed: how many seconds of the radio's time pass in one; all spans above are real time.
+        from_s: where in the radio's time to begin; now, unless what came before is wanted, too.
     """
     counters = sender.health.counters
 
@@ -256,7 +258,7 @@ async def run(
     loop = asyncio.get_running_loop()
     maker = ThreadPoolExecutor(1, thread_name_prefix="sim-radio")
     waiting: deque[tuple[float, bytes]] = deque()
-    made_s = _now_s(start_ns, speed)
+    made_s = _now_s(start_ns, speed) if from_s is None else from_s
     try:
         while until_s is None or made_s < until_s or waiting:
             now_s = _now_s(start_ns, speed)
