@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from doctor_world import STRANGER, open_to_all, verdicts, visit, write
+from waiting import free_port
 
 from vad.bus import messages as m
 from vad.bus.node import Bus
@@ -71,16 +72,13 @@ async def test_an_address_that_is_taken_and_one_that_is_free(tmp_path: Path, tak
     found = await check_daemon(wanted)
     assert verdicts(found) == [("zenoh", "bad"), ("metrics", "bad")]
     assert "in use" in found[0].text
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        free = server.getsockname()[1]
-    wanted = visit(tmp_path, bus={"listen": [f"tcp/127.0.0.1:{free}"]})
+    wanted = visit(tmp_path, bus={"listen": [f"tcp/127.0.0.1:{free_port()}"]})
     assert verdicts(await check_daemon(wanted)) == [("zenoh", "ok")]
 
 
 async def test_a_daemon_that_runs_is_asked(tmp_path: Path) -> None:
     """Robot, camera and card are its own then: what it says of them counts."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        endpoint = f"tcp/127.0.0.1:{server.getsockname()[1]}"
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
     parts = (
         m.Part(part="daemon", state="ok", rates_per_s={"frames": 14.9, "poses": 5.0}),
         m.Part(part="robot /dev/x", state="degraded", detail="no pose for 9 s. Is it on?"),
@@ -261,6 +259,6 @@ def test_drop_ins_of_the_unit_count(tmp_path: Path) -> None:
 
 
 async def test_checks_run_at_the_same_time(tmp_path: Path) -> None:
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(40):
         found = await examine(visit(tmp_path, bus={"listen": []}), ["settings", "clock"])
     assert next(f.check for f in found) == "settings"

@@ -121,8 +121,8 @@ async def running_robot(
 
 async def _watch(settings: Settings, watched: Watched, seconds: float | None, as_json: bool) -> None:
     poses: DropOldestQueue[RobotPose] = DropOldestQueue(256)
-    ends_s = math.inf if seconds is None else time.monotonic() + seconds
     async with running_robot(settings, poses) as robot:
+        ends_s = math.inf if seconds is None else time.monotonic() + seconds
         with contextlib.nullcontext() if as_json else Live(console=out, auto_refresh=False) as live:
             while time.monotonic() < ends_s:
                 with contextlib.suppress(TimeoutError):

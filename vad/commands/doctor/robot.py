@@ -98,11 +98,11 @@ async def check_robot(visit: Visit) -> list[Finding]:
         return []  # what is wrong is said, and the same once more would not help
     poses: DropOldestQueue[RobotPose] = DropOldestQueue(256)
     wants_map = visit.settings.map.file is None
-    until_s = time.monotonic() + visit.listen_s
     watched = Watched()
     first_s = 0.0
     async with running_robot(visit.settings, poses) as robot:
         health = robot.health
+        until_s = time.monotonic() + visit.listen_s
         while (now_s := time.monotonic()) < until_s:
             for pose in poses.drain():
                 watched.take(pose, time.monotonic_ns())
