@@ -10,6 +10,10 @@ from vad.bus import messages as m
 from vad.bus.session import BusSettings, open_session
 
 ROOT = Path(__file__).parents[2]
+PATIENCE_S = 40
+"""What is answered at all is answered in this time."""
+STARTED_S = 120
+"""A busy machine takes its time to load a program, and a gate is one."""
 
 
 def mac(i: int) -> str:
@@ -49,4 +53,4 @@ def settings(endpoint: str, hub: str = "home") -> BusSettings:
 
 def ask_raw(endpoint: str, selector: str) -> list[zenoh.Reply]:
     with open_session(BusSettings(mode="client", connect=(endpoint,))) as session:
-        return list(session.get(selector, target=zenoh.QueryTarget.ALL, timeout=5.0))
+        return list(session.get(selector, target=zenoh.QueryTarget.ALL, timeout=PATIENCE_S))

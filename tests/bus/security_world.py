@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TypeVar
 
 import zenoh
+from bus_world import PATIENCE_S, STARTED_S
 from waiting import free_port, until
 
 from vad.bus.gate import Gate, GateSettings
@@ -67,6 +68,7 @@ class Network:
         await until(
             lambda: self.gate.health.counters["opened"] >= times,
             f"the gate opened {times} times: {self.gate.health}",
+            STARTED_S,
         )
 
 
@@ -95,11 +97,11 @@ async def network(folder: Path, *issue: tuple[Role, str]) -> AsyncIterator[tuple
 
 def gate_pid() -> int:
     """The gate's process below this one."""
-    own = os.getpid()
-    for task in Path(f"/proc/{own}/task").iterdir():
-        for child in (task / "children").read_text().split():
-            if b"gate_process" in Path(f"/proc/{child}/cmdline").read_bytes():
-                return int(child)
+    for thread in Path("/proc/self/task").iterdir():
+        with suppress(OSError):  # threads and other children come and go meanwhile
+            for child in (thread / "children").read_text().split():
+                if b"gate_process" in Path(f"/proc/{child}/cmdline").read_bytes():
+                    return int(child)
     raise AssertionError("there is no gate")
 
 
@@ -128,12 +130,12 @@ def answer(session: zenoh.Session, key: str, payload: bytes) -> None:
     session.declare_queryable(key, zenoh.handlers.Callback(reply, None, indirect=False))
 
 
-def ask(session: zenoh.Session, key: str) -> list[bytes]:
+def ask(session: zenoh.Session, key: str, timeout_s: float = PATIENCE_S) -> list[bytes]:
     """The payloads of all answers."""
     replies = session.get(
         key,
         target=zenoh.QueryTarget.ALL,
         consolidation=zenoh.ConsolidationMode.NONE,
-        timeout=5.0,
+        timeout=timeout_s,
     )
     return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]

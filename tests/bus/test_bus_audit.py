@@ -8,7 +8,11 @@ from hypothesis import strategies as st
 
 from vad.bus.audit import AuditReader, Denied, Other, Refused
 
+pytestmark = pytest.mark.timeout(600)
+"""Much work for the processor: a busy machine takes many times as long as an idle one."""
+
 ZID = "dcf3a494386481c1c412ab9a73869acc"
+OTHER = "c2af4d36de5f47fba53c6f2e0a8f1b90"
 WHERE = (
     "2026-11-22T03:39:08.540126Z TRACE  rx-1 ThreadId(09) demux{zid=a3cd src=south:0:client/dcf3a494:2}: "
     "zenoh::net::routing::interceptor::access_control: "
@@ -32,6 +36,19 @@ def test_a_cached_attempt_is_told_without_a_name() -> None:
     assert read(f"Using cached result: {ZID} is unauthorized to {what}") == [
         Denied(ZID, "", "Declare Subscriber", "vad/home/agents/a1/csi")
     ]
+
+
+def test_a_cached_attempt_is_named_once_any_line_has_told_who_that_is() -> None:
+    found = read(
+        "ACL (ingress): caching permissions for `vad/home` ...",
+        f"{WHO} is authorized to Query (ingress) on vad/home",
+        f"Using cached result: {ZID} is unauthorized to Put (ingress) on vad/home/x",
+        f"Using cached result: {OTHER} is unauthorized to Put (ingress) on access_control: "
+        f"{OTHER} on CertCommonName(admin.boss.1)",
+        f"Using cached result: {OTHER} is unauthorized to Put (ingress) on vad/home/x",
+    )
+    names = [denied.common_name for denied in found if isinstance(denied, Denied)]
+    assert names == ["viewer.tablet.1a2b", "", ""], "a key tells no names"
 
 
 def test_what_zenoh_works_out_nobody_attempted() -> None:

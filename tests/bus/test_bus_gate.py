@@ -7,15 +7,21 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 import pytest
+from bus_world import STARTED_S
 from security_world import network
 from waiting import free_port, until
 
+from vad.bus import gate as gate_module
 from vad.bus.access import Holder, access_control
 from vad.bus.gate import Gate, GateSettings, renew_hub
 from vad.pki.certificates import HUB_DAYS, days_left, utc_now
 from vad.pki.folder import PkiFolder
+
+pytestmark = pytest.mark.timeout(300)
+"""Processes are started, and waited for one after the other: a busy machine takes its time for each."""
 
 
 @asynccontextmanager
@@ -58,14 +64,45 @@ async def test_it_opens_once_there_is_a_pki(tmp_path: Path) -> None:
         await until(lambda: "vad pki issue" in gate.health.detail, "what to do next")
         pki.issue("viewer", "tablet", 1, utc_now())
         pki.issue("viewer", "phone", 1, utc_now())
-        await until(lambda: "2 certificates in force" in gate.health.detail, "that it is open")
+        await until(lambda: "2 certificates in force" in gate.health.detail, "that it is open", STARTED_S)
 
 
-async def test_a_taken_port_is_said_and_tried_again(tmp_path: Path) -> None:
+async def test_a_taken_port_is_said_and_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    processes: list[asyncio.subprocess.Process] = []
+    start = asyncio.create_subprocess_exec
+
+    async def started(*command: str, **options: Any) -> asyncio.subprocess.Process:
+        processes.append(await start(*command, **options))
+        return processes[-1]
+
     async with network(tmp_path, ("viewer", "tablet")) as (world, _):
         port = int(world.tls.rpartition(":")[2])
+        monkeypatch.setattr(asyncio, "create_subprocess_exec", started)
         async with running(gate_for(world.pki.path, world.daemon, port=port)) as gate:
-            await until(lambda: "the port is taken" in gate.health.detail, "that it is taken")
+            await until(lambda: "the port is taken" in gate.health.detail, "that it is taken", STARTED_S)
+            await until(lambda: len(processes) == 2, "that it is tried again", STARTED_S)
+        assert all(process.returncode is not None for process in processes), "none is left behind"
+
+
+async def test_who_ends_it_while_its_process_ends_leaves_nothing_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ending = asyncio.Event()
+    gone = gate_module._gone
+
+    async def noted(process: asyncio.subprocess.Process) -> None:
+        ending.set()
+        processes.append(process)
+        await gone(process)
+
+    processes: list[asyncio.subprocess.Process] = []
+    async with network(tmp_path, ("viewer", "tablet")) as (world, _):
+        monkeypatch.setattr(gate_module, "_gone", noted)
+        port = int(world.tls.rpartition(":")[2])
+        async with running(gate_for(world.pki.path, world.daemon, port=port)):
+            await ending.wait()
+        (process,) = processes
+        assert process.returncode is not None
 
 
 async def test_an_expired_hub_certificate_is_renewed_at_start(tmp_path: Path) -> None:
@@ -73,7 +110,7 @@ async def test_an_expired_hub_certificate_is_renewed_at_start(tmp_path: Path) ->
     pki.init("home", ["hub.local"], utc_now() - timedelta(days=HUB_DAYS + 1))
     pki.issue("viewer", "tablet", 1, utc_now())
     async with network(tmp_path) as (world, _), running(gate_for(pki.path, world.daemon)) as gate:
-        await until(lambda: gate.health.state == "ok", "it is open")
+        await until(lambda: gate.health.state == "ok", "it is open", STARTED_S)
     assert days_left(pki.hub_files().ends_at, utc_now()) > HUB_DAYS - 1
 
 

@@ -30,6 +30,9 @@ from vad.bus.selectors import (
 )
 from vad.errors import VadError
 
+pytestmark = pytest.mark.timeout(600)
+"""Much work for the processor: a busy machine takes many times as long as an idle one."""
+
 MAC = "aa:bb:cc:dd:ee:01"
 
 

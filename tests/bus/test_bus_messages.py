@@ -16,6 +16,9 @@ from vad.bus.grid import grid_to_png, png_to_grid
 from vad.bus.schemas import json_schemas, write_schemas
 from vad.errors import ProtocolError
 
+pytestmark = pytest.mark.timeout(600)
+"""Much work for the processor: a busy machine takes many times as long as an idle one."""
+
 SCHEMAS = Path(__file__).parent / "schemas"
 HOW_TO_RENEW = "a wanted change? python -m vad.bus.schemas tests/bus/schemas, and say so in the commit"
 

@@ -14,6 +14,7 @@ LOG_FILTER = "warn,zenoh::net::routing::interceptor::access_control=trace"
 """What zenoh must be told to log for this."""
 
 MAX_THREADS = 64
+MAX_NAMES = 256
 
 _ANSI = re.compile(r"\x1b\[[0-9;]*m")
 _THREAD = re.compile(r"\bThreadId\((\d+)\)")
@@ -25,6 +26,7 @@ _DENIED = re.compile(
 _VERDICT = re.compile(
     r"access_control: [0-9a-f]+ on \S+ is (?:un)?authorized to [A-Za-z/ ]+ \(ingress\) on (.*)$"
 )
+_WHO = re.compile(r"([0-9a-f]+) on \S*CertCommonName\(([^)]*)\)")
 _COMMON_NAME = re.compile(r"CertCommonName\(([^)]*)\)")
 _REFUSED = re.compile(r"\bWARN\b.*zenoh_link_tls::\w+: (?P<reason>.*?)(?:\. Hint: .*)?$")
 
@@ -69,6 +71,7 @@ class AuditReader:
 
     def __init__(self) -> None:
         self._working_out: dict[str, str] = {}  # thread -> the key whose permissions it works out
+        self._names: dict[str, str] = {}  # session's id -> its common name, which only some lines tell
 
     def read(self, line: str) -> Denied | Refused | Other | None:
         """What a line tells; None where it is nothing of this."""
@@ -90,6 +93,11 @@ class AuditReader:
                 self._working_out.clear()
             self._working_out[thread] = caching["key"]
             return None
+        # Matched where the message begins: behind it may stand a key that somebody made up.
+        if who := _WHO.match(line.partition("access_control: ")[2]):
+            if len(self._names) >= MAX_NAMES:
+                self._names.clear()
+            self._names[who[1]] = who[2]
         denied = _DENIED.search(line)
         if denied is None or not denied["cached"]:
             verdict = _VERDICT.search(line)
@@ -100,4 +108,5 @@ class AuditReader:
         if denied is None:
             return None
         name = _COMMON_NAME.search(denied["subject"] or "")
-        return Denied(denied["zid"], name[1] if name else "", denied["what"].strip(), denied["key"] or "")
+        common_name = name[1] if name else self._names.get(denied["zid"], "")
+        return Denied(denied["zid"], common_name, denied["what"].strip(), denied["key"] or "")

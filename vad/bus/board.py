@@ -147,9 +147,9 @@ class Board:
         kept = list(self.tables[pattern].items())[-count:]
         self.tables[pattern] = MappingProxyType(dict(kept))
 
-    def tell(self, event: Entry) -> None:
-        """Remember an event among the last EVENTS_KEPT, the newest first."""
-        self.events = ((now_rfc3339(), event.form.payload), *self.events[: EVENTS_KEPT - 1])
+    def tell(self, event: Entry, at: str) -> None:
+        """Remember an event, published at this time, among the last EVENTS_KEPT, the newest first."""
+        self.events = ((at, event.form.payload), *self.events[: EVENTS_KEPT - 1])
 
     def all_devices(self, name: str, source: m.Source) -> Form:
         """Every device in one answer, prepared at the first question after a change."""

@@ -36,7 +36,8 @@ WATCH_S = 1.0
 RETRY_FIRST_S = 0.5
 RETRY_FACTOR = 2.0
 RETRY_MAX_S = 10.0
-OPEN_S = 10.0
+OPEN_S = 30.0
+"""How long the gate's process may take to open: on a busy hub a program is slow to start."""
 RENEW_EVERY_S = 3600.0
 
 PUT_BYTES = 1024 * 1024
@@ -176,10 +177,8 @@ class Gate:
                 return False
             return await self._until_changed(process.stdout, detail, seen)
         finally:
-            with suppress(ProcessLookupError):
-                process.kill()
-            await process.wait()
             self._connected = []
+            await _end(process)
 
     async def _opened(self, reports: asyncio.StreamReader, detail: str) -> bool:
         try:
@@ -301,6 +300,31 @@ def renew_hub(folder: PkiFolder, now: datetime) -> str:
     folder.rotate_hub(folder.hub_addresses(), now)
     _log.info("the hub's certificate ended in %.0f days and was renewed", left)
     return ""
+
+
+async def _end(process: asyncio.subprocess.Process) -> None:
+    """Kill it and wait until it is gone with its pipes, also where whoever waits is cancelled meanwhile."""
+    with suppress(ProcessLookupError):
+        process.kill()
+    gone = asyncio.ensure_future(_gone(process))
+    try:
+        await asyncio.shield(gone)
+    except asyncio.CancelledError:
+        await asyncio.wait({gone})
+        raise
+
+
+async def _gone(process: asyncio.subprocess.Process) -> None:
+    """To the last of its pipes: `wait` alone leaves them open where the process had ended by itself."""
+    assert process.stdin is not None
+    assert process.stdout is not None
+    process.stdin.close()
+    with suppress(ConnectionError):
+        while await process.stdout.read(REPORT_BYTES):
+            pass
+    await process.wait()
+    with suppress(ConnectionError):
+        await process.stdin.wait_closed()
 
 
 async def _next(reports: asyncio.StreamReader) -> GateReport | None:

@@ -183,8 +183,9 @@ class Bus:
 
     def publish_event(self, message: m.EventMessage) -> None:
         """Tell subscribers what happened; who asks is answered with the last ones."""
-        entry = entry_of(self.keys.events, message, self.keys.hub)
-        self._board.tell(entry)
+        now = now_rfc3339()  # one time for the message and for `since`, which asks for what is later
+        entry = entry_of(self.keys.events, message, self.keys.hub, now)
+        self._board.tell(entry, now)
         self._put(entry)
 
     def forget_device(self, mac: str) -> None:
