@@ -6,6 +6,7 @@ import asyncio
 import datetime
 import ipaddress
 import shutil
+import signal
 import socket
 import ssl
 import subprocess
@@ -26,6 +27,10 @@ from waiting import free_port
 
 MOSQUITTO = shutil.which("mosquitto", path="/usr/sbin:/usr/bin:/usr/local/sbin:/usr/local/bin")
 needs_mosquitto = pytest.mark.skipif(MOSQUITTO is None, reason="no mosquitto here: apt-get install mosquitto")
+
+
+START_S = 40.0
+"""How long a broker on a busy machine may take for anything."""
 
 
 class Mosquitto:
@@ -55,7 +60,7 @@ class Mosquitto:
         assert MOSQUITTO is not None
         with self._log.open("ab") as log:
             self._process = subprocess.Popen([MOSQUITTO, "-c", str(self._file)], stdout=log, stderr=log)
-        until = time.monotonic() + 10
+        until = time.monotonic() + START_S
         while time.monotonic() < until:
             assert self._process.poll() is None, self._log.read_text()
             with socket.socket() as probe:
@@ -63,6 +68,11 @@ class Mosquitto:
                     return
             time.sleep(0.02)
         raise AssertionError("mosquitto does not listen")
+
+    def freeze(self) -> None:
+        """It takes and says nothing more, and its connections stay."""
+        assert self._process is not None
+        self._process.send_signal(signal.SIGSTOP)
 
     def kill(self) -> None:
         """kill -9."""
@@ -83,7 +93,7 @@ class Watcher:
     """A client that keeps the last payload of every topic, and counts what came."""
 
     def __init__(self, port: int, **options: Any) -> None:
-        self._client = aiomqtt.Client("127.0.0.1", port, **options)
+        self._client = aiomqtt.Client("127.0.0.1", port, timeout=START_S, **options)
         self.payloads: dict[str, bytes] = {}
         self.retained: dict[str, bytes] = {}
         self.came: list[tuple[str, bytes]] = []
@@ -138,7 +148,7 @@ class Watcher:
         return value
 
 
-async def retained_at(port: int, timeout_s: float = 5.0) -> dict[str, bytes]:
+async def retained_at(port: int, timeout_s: float = 40.0) -> dict[str, bytes]:
     """What the broker retains now: what a client that comes now is sent first."""
     marker = "watcher/marker"
     async with Watcher(port) as watcher:

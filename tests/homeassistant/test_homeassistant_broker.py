@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 from link_world import TOPICS, closed_bus, home_assistant
-from mosquitto_world import Mosquitto, Watcher, needs_mosquitto, retained_at
+from mosquitto_world import START_S, Mosquitto, Watcher, needs_mosquitto, retained_at
 from waiting import free_port, until
 
 from vad.bus import messages as m
@@ -23,12 +23,17 @@ from vad.homeassistant import link
 
 LAMP, PHONE = "f4:f5:d8:d3:35:b2", "3a:11:22:33:44:55"
 
-pytestmark = needs_mosquitto
+DRAWN_S = 320.0
+"""Drawing gives way to all else on a machine."""
+
+pytestmark = [needs_mosquitto, pytest.mark.timeout(300)]
 
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The waits of a year's run, shortened."""
+    """The waits of a year's run, shortened; a broker on a busy machine has time."""
+    monkeypatch.setattr(broker_module, "ANSWER_TIMEOUT_S", START_S)
+    monkeypatch.setattr(broker_module, "FAREWELL_S", START_S)
     monkeypatch.setattr(link, "FIRST_RETRY_S", 0.05)
     monkeypatch.setattr(link, "LAST_RETRY_S", 0.2)
     monkeypatch.setattr(link, "STATUS_EVERY_NS", 50_000_000)
@@ -137,13 +142,25 @@ async def test_something_else_at_the_brokers_port(
 
 
 async def test_the_daemon_ends_soon_while_a_broker_does_not_answer(
-    bus: Bus, tmp_path: Path, mute: int
+    bus: Bus, tmp_path: Path, mute: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """It does not wait for the answer: that would be half an hour here."""
+    monkeypatch.setattr(broker_module, "ANSWER_TIMEOUT_S", 1800.0)
+    monkeypatch.setattr(broker_module, "FAREWELL_S", 0.5)
     async with home_assistant(bus, tmp_path, mute) as running:
         await until(_connecting)
         assert running.health.state == "starting"
-        begun_s = time.monotonic()
-    assert time.monotonic() - begun_s < 2.0
+
+
+async def test_a_broker_that_hangs_at_the_end_leaves_no_connection(
+    bus: Bus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else its socket, and a task beside it, would be nobody's: `no_leaked_tasks` looks for that."""
+    monkeypatch.setattr(broker_module, "FAREWELL_S", 0.2)
+    with Mosquitto(tmp_path) as broker:
+        async with home_assistant(bus, tmp_path, broker.port) as running:
+            await until(lambda: running.health.state == "ok", "it is connected")
+            broker.freeze()
 
 
 def _connecting() -> bool:
@@ -223,7 +240,7 @@ async def test_a_storm_of_changes_becomes_few_updates_and_the_last_counts(
     with Mosquitto(tmp_path) as broker:
         async with Watcher(broker.port) as watcher, home_assistant(bus, tmp_path, broker.port):
             await watcher.until_says(TOPICS.availability, b"online")
-            before = len(watcher.came)
+            before, begun_s = len(watcher.came), time.monotonic()
             for i in range(1000):
                 bus.publish_device(device(LAMP, x_m=float(i)))
                 bus.publish_device(device(LAMP, x_m=float(i)))
@@ -232,14 +249,18 @@ async def test_a_storm_of_changes_becomes_few_updates_and_the_last_counts(
             await watcher.until(
                 lambda: watcher.json(TOPICS.device(LAMP))["x_m"] == 999.0, "the last of a thousand"
             )
+            took_s = time.monotonic() - begun_s
             came = [topic for topic, _ in watcher.came[before:]]
-    assert came.count(TOPICS.device(LAMP)) <= 4
+    # One that was due, one on its way, and then one each 0.2 s, however long the storm takes.
+    assert came.count(TOPICS.device(LAMP)) <= 2 + took_s / 0.2
     assert TOPICS.device_config(LAMP) not in came
 
 
 async def test_a_hundred_devices_cost_little_and_the_loop_goes_on(bus: Bus, tmp_path: Path) -> None:
     macs = [f"02:00:00:00:00:{i:02x}" for i in range(100)]
     with Mosquitto(tmp_path) as broker:
+        async with Watcher(broker.port) as watcher:
+            bare_s = await _bare_s(watcher, 2 * len(macs))
         async with Watcher(broker.port) as watcher, home_assistant(bus, tmp_path, broker.port):
             await watcher.until_says(TOPICS.availability, b"online")
             stalls = asyncio.create_task(_longest_stall_s())
@@ -254,9 +275,19 @@ async def test_a_hundred_devices_cost_little_and_the_loop_goes_on(bus: Bus, tmp_
                 stalls.cancel()
                 stall_s = await stalls
     print(  # noqa: T201 - the measured figure
-        f"100 devices: {took_s:.2f} s, {used_s:.2f} s of a core, the loop stood still {stall_s * 1e3:.0f} ms"
+        f"100 devices: {took_s:.2f} s, {used_s:.2f} s of a core ({bare_s:.2f} s by hand), "
+        f"the loop stood still {stall_s * 1e3:.0f} ms"
     )
-    assert used_s < 2.0
+    assert used_s < 6.0 * bare_s  # as much was measured
+
+
+async def _bare_s(watcher: Watcher, count: int) -> float:
+    """What so many messages cost this machine's processor, to and from the broker, without anything else."""
+    used_s = time.process_time()
+    for i in range(count):
+        await watcher.put(f"bare/{i}", bytes(600), retain=True)
+    await watcher.until(lambda: f"bare/{count - 1}" in watcher.payloads, "the last one")
+    return time.process_time() - used_s
 
 
 async def _longest_stall_s() -> float:
@@ -265,13 +296,14 @@ async def _longest_stall_s() -> float:
     try:
         while True:
             slept_s = time.monotonic()
-            await asyncio.sleep(0.001)
-            longest_s = max(longest_s, time.monotonic() - slept_s - 0.001)
+            await asyncio.sleep(0.01)  # seldom: what this takes grows with the time
+            longest_s = max(longest_s, time.monotonic() - slept_s - 0.01)
     except asyncio.CancelledError:
         return longest_s
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(700)
 async def test_the_map_is_a_picture_that_follows(bus: Bus, tmp_path: Path) -> None:
     cells = np.zeros((40, 60), np.int8)
     cells[0, :] = cells[-1, :] = 100
@@ -291,12 +323,12 @@ async def test_the_map_is_a_picture_that_follows(bus: Bus, tmp_path: Path) -> No
     bus.publish_device(device(LAMP, y_m=1.0))
     with Mosquitto(tmp_path) as broker:
         async with Watcher(broker.port) as watcher, home_assistant(bus, tmp_path, broker.port):
-            await watcher.until(lambda: TOPICS.map in watcher.payloads, "the picture", 45)
+            await watcher.until(lambda: TOPICS.map in watcher.payloads, "the picture", DRAWN_S)
             first = watcher.payloads[TOPICS.map]
             assert first.startswith(b"\x89PNG")
             bus.publish_device(device(LAMP, y_m=1.0, last_seen="2026-01-01T00:00:00Z"))
             bus.publish_device(device(LAMP, y_m=1.5))
-            await watcher.until(lambda: watcher.payloads[TOPICS.map] != first, "another picture", 45)
+            await watcher.until(lambda: watcher.payloads[TOPICS.map] != first, "another picture", DRAWN_S)
             assert [topic for topic, _ in watcher.came].count(TOPICS.map) == 2
 
 

@@ -58,6 +58,7 @@ async def test_no_process_is_no_picture(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(400)
 async def test_a_damaged_plan_is_no_picture(tmp_path: Path) -> None:
     with pytest.raises(VadError, match="cannot be drawn"):
         await draw(scene(grid=b"no PNG"), tmp_path)

@@ -102,18 +102,18 @@ async def connected(
     except mqtt.MqttError as error:
         raise BrokerError(f"the connection is lost ({error})", where=where) from error
     finally:
-        with contextlib.suppress(mqtt.MqttError, TimeoutError):
-            if will_topic is not None:  # the last will comes only for who goes without a word
+        if will_topic is not None:  # the last will comes only for who goes without a word
+            with contextlib.suppress(mqtt.MqttError, TimeoutError):
                 async with asyncio.timeout(FAREWELL_S):
                     await client.publish(will_topic, OFFLINE, qos=1, retain=True)
-            await client.__aexit__(None, None, None)
+        await _abandon(client, mqtt)  # also where nobody acknowledged that
 
 
 _REMEDY = "Does the broker run, and are mqtt.host and mqtt.port right?"
 
 
 async def _abandon(client: aiomqtt.Client, mqtt: ModuleType) -> None:
-    """Close what a connection that did not come about has left open."""
+    """Close a connection, or what one that did not come about has left open."""
     with contextlib.suppress(mqtt.MqttError, TimeoutError):
         async with asyncio.timeout(CLOSE_S):  # the socket closes at once; who listens is not told
             await client.__aexit__(None, None, None)

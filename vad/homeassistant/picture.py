@@ -24,8 +24,9 @@ from vad.bus import messages as m
 from vad.errors import VadError
 
 NICE = 5
-TIMEOUT_S = 60.0
-"""Two seconds is what it takes; on a busy hub some."""
+TIMEOUT_S = 300.0
+"""Two seconds of work is what it takes, but all others go first: on a busy hub that may be minutes, and what
+is given up begins anew."""
 
 
 class Scene(msgspec.Struct, frozen=True):
