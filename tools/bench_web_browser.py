@@ -16,15 +16,34 @@ from typing import Any, Self
 
 import aiohttp
 
-START_S = 60.0
-ANSWER_S = 30.0
-END_S = 10.0
+START_S = 90.0
+ANSWER_S = 60.0
+END_S = 20.0
 PROGRAMS = ("chromium", "chromium-browser", "google-chrome")
 
 
 def chromium() -> str | None:
     """The browser's program; None where there is none."""
     return next((found for name in PROGRAMS if (found := shutil.which(name))), None)
+
+
+STANDS_STILL = """new Promise((found) => {
+  let before = '';
+  const look = () => {
+    const node = document.querySelector(SELECTOR);
+    if (!node?.checkVisibility()) before = '';
+    else {
+      node.scrollIntoView({block: 'nearest'});
+      const box = node.getBoundingClientRect();
+      const at = [box.left + box.width / 2, box.top + box.height / 2];
+      if (String(at) === before && node.contains(document.elementFromPoint(...at))) return found(at);
+      before = String(at);
+    }
+    requestAnimationFrame(look);
+  };
+  look();
+})"""
+"""The middle of a node that can be pressed there: the same in two frames, and nothing lies over it."""
 
 
 class BrowserError(Exception):
@@ -40,6 +59,7 @@ class Browser:
         self._http: aiohttp.ClientSession | None = None
         self._socket: aiohttp.ClientWebSocketResponse | None = None
         self._reading: asyncio.Task[None] | None = None
+        self._draining: asyncio.Task[None] | None = None
         self._asked: dict[int, asyncio.Future[Any]] = {}
         self._listeners: dict[str, Callable[[dict[str, Any]], None]] = {}
         self._number = 0
@@ -73,6 +93,7 @@ class Browser:
         try:
             async with asyncio.timeout(START_S):
                 address = await self._address()
+            self._draining = asyncio.create_task(self._drain())
             self._http = aiohttp.ClientSession()
             self._socket = await self._http.ws_connect(address, max_msg_size=0)
             self._reading = asyncio.create_task(self._read())
@@ -151,6 +172,13 @@ class Browser:
                 return line.decode().partition("DevTools listening on ")[2].strip()
         raise BrowserError(f"the browser does not start: {said[-500:].decode(errors='replace')}")
 
+    async def _drain(self) -> None:
+        """Take what else the browser says on standard error: into a full pipe it would wait to say it."""
+        assert self._process is not None
+        assert self._process.stderr is not None
+        while await self._process.stderr.read(65_536):
+            pass
+
     async def _read(self) -> None:
         assert self._socket is not None
         async for message in self._socket:
@@ -169,9 +197,10 @@ class Browser:
     async def _end(self) -> None:
         if self._socket is not None:
             await self._socket.close()
-        if self._reading is not None:
-            self._reading.cancel()
-            await asyncio.wait({self._reading})
+        for task in (self._reading, self._draining):
+            if task is not None:
+                task.cancel()
+                await asyncio.wait({task})
         if self._http is not None:
             await self._http.close()
         if self._process is not None:
@@ -196,10 +225,14 @@ class Page:
         self.requests: list[str] = []
         self._browser = browser
         self._target = target
+        self._documents: set[str] = set()  # by what loaded them
+        self._loading: set[str] = set()  # requests under way, but for a stream, which never ends
+        self._heard = asyncio.Event()
 
     def heard(self, said: dict[str, Any]) -> None:
         """Something happened in the tab."""
         method, told = said["method"], said["params"]
+        self._heard.set()
         if method == "Runtime.exceptionThrown":
             details = told["exceptionDetails"]
             self.problems.append(details.get("exception", {}).get("description", details["text"]))
@@ -209,16 +242,35 @@ class Page:
             self.problems.append(str([a.get("value", a.get("description")) for a in told["args"]]))
         elif method == "Network.requestWillBeSent":
             self.requests.append(told["request"]["url"])
+            if told.get("type") != "EventSource":
+                self._loading.add(told["requestId"])
+        elif method in ("Network.loadingFinished", "Network.loadingFailed"):
+            self._loading.discard(told["requestId"])
+        elif method == "Page.frameNavigated":
+            self._documents.add(told["frame"]["loaderId"])
 
     async def call(self, method: str, **parameters: Any) -> Any:
         """Ask this tab."""
         return await self._browser.call(method, self.session, **parameters)
 
     async def go(self, url: str) -> None:
-        """Load an address."""
+        """Load an address; the page is asked from now on, no longer the one before it."""
+        self._loading.clear()
         answer = await self.call("Page.navigate", url=url)
         if "errorText" in answer:
             raise BrowserError(f"{url}: {answer['errorText']}")
+        if "loaderId" in answer:  # else it is the same document, elsewhere
+            await self._hears(lambda: answer["loaderId"] in self._documents, f"{url} does not appear")
+
+    async def _hears(self, condition: Callable[[], object], trouble: str) -> None:
+        """Wait for what the browser tells."""
+        try:
+            async with asyncio.timeout(ANSWER_S):
+                while not condition():
+                    self._heard.clear()
+                    await self._heard.wait()
+        except TimeoutError:
+            raise BrowserError(f"not in {ANSWER_S:.0f} s: {trouble}; problems: {self.problems}") from None
 
     async def value(self, script: str, *, within_s: float = ANSWER_S) -> Any:
         """What an expression, or a promise, comes to in the page."""
@@ -235,7 +287,7 @@ class Page:
             raise BrowserError(details.get("exception", {}).get("description", details["text"]))
         return answer["result"].get("value")
 
-    async def until(self, script: str, timeout_s: float = 20.0) -> Any:
+    async def until(self, script: str, timeout_s: float = ANSWER_S) -> Any:
         """The expression's value as soon as it is true, looked at in every frame of the page."""
         waiting = (
             "new Promise((found) => { const look = () => { let value = null; "
@@ -249,12 +301,11 @@ class Page:
 
     async def click(self, selector: str) -> None:
         """Press the pointer in the middle of what the CSS selector finds, once it is there to be pressed."""
-        await self.until(f"document.querySelector({json.dumps(selector)}).checkVisibility()")
-        x, y = await self.value(
-            f"(() => {{ const node = document.querySelector({json.dumps(selector)});"
-            " node.scrollIntoView({block: 'nearest'}); const box = node.getBoundingClientRect();"
-            " return [box.left + box.width / 2, box.top + box.height / 2]; })()"
-        )
+        await self._hears(lambda: not self._loading, f"all that it asked for: {sorted(self._loading)}")
+        try:
+            x, y = await self.value(STANDS_STILL.replace("SELECTOR", json.dumps(selector)))
+        except TimeoutError:
+            raise BrowserError(f"cannot be pressed: {selector}; problems: {self.problems}") from None
         for kind in ("mousePressed", "mouseReleased"):
             await self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
 

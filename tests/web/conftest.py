@@ -26,7 +26,7 @@ def serving(tmp_path: Path) -> Serving:
                 yield made
             finally:
                 task.cancel()
-                await asyncio.wait({task}, timeout=5)
+                await asyncio.wait({task}, timeout=40)
                 assert task.cancelled(), "the page ends when it is told to"
 
     return serve

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-import socket
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
+from waiting import free_port
 from web_world import settings, status
 
 from vad.bus import messages as m
@@ -30,9 +30,7 @@ map: {file: floor.yaml}
 
 async def asked(*parts: m.Part) -> tuple[int, str]:
     """Exit code and output of `vad web` where the daemon has these parts."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
     async with Bus(BusSettings(listen=(endpoint,)), source="simulated") as bus:
         bus.publish_status(status("now", parts=parts))
         result = await asyncio.to_thread(CliRunner().invoke, app, ["web", "--endpoint", endpoint])

@@ -11,10 +11,11 @@ from pathlib import Path
 import aiohttp
 import msgspec
 import pytest
-from waiting import until
+from waiting import free_port, until
 from web_world import Event, Serving, World, device, events, mac, status, world
 
 from vad.bus import messages as m
+from vad.web import server as server_module
 from vad.web import stream as stream_module
 from vad.web.home import Robot
 from vad.web.stream import MAX_STREAMS
@@ -23,12 +24,12 @@ QUIET = aiohttp.ClientTimeout(total=None)
 
 
 async def take(source: AsyncIterator[Event], count: int) -> list[Event]:
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(40):
         return [await anext(source) for _ in range(count)]
 
 
 async def find(source: AsyncIterator[Event], key: str) -> Event:
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(40):
         async for event in source:
             if event.kind == "message" and event.key == key:
                 return event
@@ -88,35 +89,51 @@ async def test_who_comes_back_hears_only_what_was_missed(serving: Serving) -> No
             assert (await take(events(answer), 1))[0].kind == "reset"
 
 
-async def test_a_slow_reader_gets_the_newest_and_costs_no_more_than_its_window(serving: Serving) -> None:
-    """A browser that does not read while 4,000 changes of 20 devices happen."""
+async def deaf_reader(made: World) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    """A browser that asks for the stream and then reads nothing."""
+    small = socket.socket()
+    small.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
+    small.setblocking(False)
+    await asyncio.get_running_loop().sock_connect(small, ("127.0.0.1", made.page.port))
+    reader, writer = await asyncio.open_connection(sock=small, limit=2**20)
+    reader._transport.pause_reading()  # type: ignore[attr-defined]
+    writer.write(b"GET /api/stream HTTP/1.1\r\nHost: localhost\r\n\r\n")
+    await until(lambda: made.page.streams.count == 1, "the stream begins")
+    return reader, writer
+
+
+async def test_a_slow_reader_gets_the_newest_and_costs_no_more_than_its_window(
+    serving: Serving, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A browser that does not read while 4,000 changes of 20 devices happen, with its window full."""
+    monkeypatch.setattr(stream_module, "SLOW_S", 600.0)
+    monkeypatch.setattr(stream_module, "GAP_S", 0.0)
     async with serving(devices=20) as made:
-        small = socket.socket()
-        small.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
-        small.setblocking(False)
-        await asyncio.get_running_loop().sock_connect(small, ("127.0.0.1", made.page.port))
-        reader, writer = await asyncio.open_connection(sock=small, limit=2**20)
-        reader._transport.pause_reading()  # type: ignore[attr-defined]
-        writer.write(b"GET /api/stream HTTP/1.1\r\nHost: localhost\r\n\r\n")
-        await until(lambda: made.page.streams.count == 1, "the stream begins")
+        reader, writer = await deaf_reader(made)
         base = [device(i) for i in range(20)]
-        for turn in range(200):
-            for one in base:
-                made.bus.publish_device(msgspec.structs.replace(one, walks=turn + 1))
-            await asyncio.sleep(0)
-        told = made.page.health.counters["told"]
-        assert told < 2500, "no more than what fits into the sockets' buffers went out"
+
+        async def told_of_changes() -> int:
+            before = made.page.health.counters["told"]
+            for turn in range(200):
+                for one in base:
+                    made.bus.publish_device(msgspec.structs.replace(one, walks=turn + 1))
+                await asyncio.sleep(0)
+            return int(made.page.health.counters["told"] - before)
+
+        # What the sockets' buffers hold is the kernel's affair; when they are full nothing more goes out.
+        while await told_of_changes():
+            pass
         made.bus.publish_device(device(0, name="the last"))
         reader._transport.resume_reading()  # type: ignore[attr-defined]
         last: dict[str, str] = {}
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(40):
             while last.get(f"devices/{mac(0)}") != "the last":
                 line = await reader.readline()
                 if line.startswith(b'data: {"key":"devices'):
                     data = json.loads(line[6:])
                     last[data["key"]] = data["value"].get("name", "")
         assert len([key for key in last if not key.endswith("heatmap")]) == 20
-        assert made.page.health.counters["coalesced"] > 1500
+        assert made.page.health.counters["coalesced"] > 3900
         writer.close()
         await writer.wait_closed()
         await until(lambda: made.page.streams.count == 0, "the stream ends with its browser")
@@ -127,12 +144,9 @@ async def test_a_reader_that_takes_nothing_is_let_go(
 ) -> None:
     monkeypatch.setattr(stream_module, "SLOW_S", 0.2)
     async with serving(devices=20) as made:
-        reader, writer = await asyncio.open_connection("127.0.0.1", made.page.port)
-        reader._transport.pause_reading()  # type: ignore[attr-defined]
-        writer.write(b"GET /api/stream HTTP/1.1\r\nHost: localhost\r\n\r\n")
-        await until(lambda: made.page.streams.count == 1, "the stream begins")
+        _, writer = await deaf_reader(made)
         base, turn = [device(i) for i in range(20)], 0
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(40):
             while not made.page.health.counters["too_slow"]:
                 turn += 1
                 for one in base:
@@ -184,19 +198,21 @@ async def test_the_robot_is_asked_for_only_while_somebody_looks(serving: Serving
             await until(lambda: made.asked > asked + 1, "it is asked again", timeout_s=0.5)
 
 
-async def test_the_page_ends_at_once_with_streams_open(tmp_path: Path) -> None:
-    async with world(tmp_path) as made:
+async def test_the_page_ends_at_once_with_streams_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It waits neither for a stream to have something to tell nor for the time that answers get."""
+    monkeypatch.setattr(stream_module, "ALIVE_S", 600.0)
+    monkeypatch.setattr(server_module, "END_S", 600.0)
+    async with world(tmp_path, port=free_port()) as made:
         task = asyncio.create_task(made.page.run())
         await until(lambda: made.page.health.state == "ok", "the page listens")
         answers = [await streaming(made) for _ in range(5)]
-        loop = asyncio.get_running_loop()
-        begun_s = loop.time()
         task.cancel()
-        await asyncio.wait({task})
-        assert loop.time() - begun_s < 1.0
+        await asyncio.wait({task}, timeout=40)
         assert task.cancelled()
         for answer in answers:
-            async with asyncio.timeout(5):
+            async with asyncio.timeout(40):
                 await answer.content.read()
             answer.close()
         with pytest.raises(aiohttp.ClientConnectionError):

@@ -88,7 +88,8 @@ async function showIgnored() {
   const { ignored } = answer.body;
   byId("ignored").hidden = ignored.length === 0;
   setText(byId("ignored-count"), String(ignored.length));
-  byId("ignored-list").replaceChildren(...ignored.map((device) => {
+  const list = byId("ignored-list");
+  const fresh = ignored.map((device) => {
     const seen = device.last_seen ? `, last seen ${ago(device.last_seen)}` : "";
     const note = device.by_settings ? "by the settings" : `${device.mac}${seen}`;
     const back = account.mayChange && !device.by_settings
@@ -96,7 +97,10 @@ async function showIgnored() {
       : null;
     return el("li", {}, el("span", { class: "row-main" }, el("span", { class: "row-name" }, bdi(printable(device.name || device.mac))),
       el("span", { class: "note", text: note })), back);
-  }));
+  });
+  // what is the same stays: a button that is being pressed must not go from under the finger
+  const words = (nodes) => [...nodes].map((node) => node.textContent).join("\n");
+  if (words(list.children) !== words(fresh)) list.replaceChildren(...fresh);
   byId("ignored").title = counted(ignored.length, "ignored device");
 }
 
