@@ -147,9 +147,9 @@ def _back_up(db: sqlite3.Connection, path: Path, version: int) -> Path:
         draft.unlink(missing_ok=True)
         raise
     _sync_folder(path.parent)
-    for old in sorted(path.parent.glob(f"{path.name}.v*.bak"), key=lambda p: p.stat().st_mtime)[
-        :-BACKUPS_KEPT
-    ]:
+    # By the time in the name: a file's own counts milliseconds, and is another one where it was copied.
+    made = sorted(path.parent.glob(f"{path.name}.v*.bak"), key=lambda one: one.name.rpartition("-")[2])
+    for old in made[:-BACKUPS_KEPT]:
         old.unlink()
     log.info("the database is brought up to date; as it was before, it is kept as %s", backup)
     return backup
