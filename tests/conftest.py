@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import shutil
+import signal
 import subprocess
 import threading
 from collections.abc import AsyncIterator, Iterator
@@ -12,15 +13,24 @@ from pathlib import Path
 
 import pytest
 import pytest_asyncio
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as vad.cli does, before NumPy is imported
 
+# A shell has what it starts in the background ignore Ctrl-C, and what that starts in turn: tests send it.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
 os.environ["COLUMNS"] = "160"  # tables look alike in a terminal, in a pipe and in a parallel run
 
-# How long an example takes says how busy the machine is, not whether the code is right.
+# How long an example takes, or its making, says how busy the machine is, not whether the code is right.
 # In CI every run tries the same examples; elsewhere each run looks for new ones.
-settings.register_profile("vad", deadline=None, derandomize="CI" in os.environ)
+settings.register_profile(
+    "vad",
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
+    derandomize="CI" in os.environ,
+)
 settings.load_profile("vad")
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -60,7 +70,7 @@ def no_leaked_threads() -> Iterator[None]:
         if t not in before and not t.daemon and not t.name.startswith("asyncio_")
     ]
     for thread in leaked:
-        thread.join(timeout=2.0)
+        thread.join(timeout=20.0)  # one that ends by itself is none, however busy the machine
     still = [t.name for t in leaked if t.is_alive()]
     assert not still, f"threads left behind: {still}"
 

@@ -19,6 +19,9 @@ from bench_locate import run_unit
 from bench_locate_cases import home_cases, paper_cases, recorded
 from bench_locate_score import Case, Score, solve
 
+pytestmark = pytest.mark.timeout(600)
+"""Much work for the processor: a busy machine takes many times as long as an idle one."""
+
 
 def judged(cases: Callable[[], Iterator[list[Case]]], tag: str) -> tuple[list[Score], Score]:
     """The scores of the cases with this tag: each walk, and all together."""

@@ -10,7 +10,7 @@ import pytest
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(240)
+@pytest.mark.timeout(900)
 def test_the_demo_places_the_device(tmp_path: Path) -> None:
     home = tmp_path / "home"
     done = subprocess.run(

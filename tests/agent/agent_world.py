@@ -12,20 +12,23 @@ import numpy as np
 import zenoh
 from waiting import until
 
+from vad.agent.collector import CLOCK_ERROR_NS
 from vad.agent.info import AgentInfo
 from vad.agent.node import Node
 from vad.bus.keys import HubKeys
 from vad.bus.session import BusSettings, open_session
+from vad.capture.handshake import Answer
 from vad.csi.bfee import encode_bodies
 from vad.csi.follow import FollowLog
 from vad.csi.logfile import record
-from vad.daemon.agents import Agents, RemoteCard
+from vad.daemon.agents import Agents, Line, RemoteCard
 from vad.sim.driver import FifoSender
 
 HUB = "home"
 MAC = "00:16:ea:00:00:01"
 KEYS = HubKeys(HUB)
 BFEE = 0xBB
+PACKETS_EVERY_S = 0.02
 
 
 class Card:
@@ -85,12 +88,45 @@ async def hearing(session: zenoh.Session) -> AsyncIterator[Agents]:
             await task
 
 
-async def there(agents: Agents, mac: str = MAC, timeout_s: float = 15.0) -> RemoteCard:
+async def there(agents: Agents, mac: str = MAC, timeout_s: float = 40.0) -> RemoteCard:
     """The agent's card, once the hub has heard of it."""
-    await until(lambda: agents.card_of(mac) is not None, f"an agent with the card {mac}", timeout_s)
-    card = agents.card_of(mac)
-    assert card is not None
-    return card
+    found: list[RemoteCard] = []
+
+    def come() -> bool:
+        card = agents.card_of(mac)
+        found.extend([card] if card is not None else [])
+        return bool(found)
+
+    await until(come, f"an agent with the card {mac}", timeout_s)
+    return found[0]
+
+
+async def good_clock(node: Node) -> None:
+    """Until the agent knows the hub's time well enough for a session; that takes a busy machine a while."""
+    clock = node.collector.clock
+    await until(
+        lambda: clock.known and clock.error_ns(time.monotonic_ns()) < CLOCK_ERROR_NS / 2,
+        "the agent knows the hub's time",
+    )
+
+
+async def send(card: Card, times: int = 1_000_000, n: int = 20) -> None:
+    """n packets every 20 ms."""
+    for _ in range(times):
+        card.send(n)
+        await asyncio.sleep(PACKETS_EVERY_S)
+
+
+async def answered(line: Line, count: int = 1) -> list[Answer]:
+    """The next answers."""
+    answers: list[Answer] = []
+
+    def come() -> bool:
+        answers.extend(line.heard())
+        return len(answers) >= count
+
+    await until(come, f"{count} answers of the agent")
+    return answers
 
 
 @contextlib.asynccontextmanager

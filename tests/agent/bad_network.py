@@ -40,6 +40,7 @@ class BadNetwork:
         finally:
             server.close()
             self.cut()
+            await asyncio.gather(*self._links, return_exceptions=True)
             await server.wait_closed()
 
     def cut(self) -> None:

@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
-import asyncio
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from agent_world import KEYS, MAC, Card, hearing, router, running_node, there
+from agent_world import (
+    KEYS,
+    MAC,
+    Card,
+    answered,
+    good_clock,
+    hearing,
+    router,
+    running_node,
+    send,
+    there,
+)
 from bad_network import BadNetwork
-from waiting import free_port, until
+from waiting import free_port, running, until
 
 from vad.agent.frames import MAX_FRAME_BYTES
 from vad.agent.info import decode_info
 from vad.capture.handshake import Abort, Going, Start, Started, Stop, Stopped
 from vad.csi.packets import CsiBatch
-from vad.daemon.agents import Line
+from vad.daemon.agents import HEARD_OVER_NS
 from vad.mac import mac_from_text
 
 SECOND_NS = 1_000_000_000
@@ -27,26 +36,6 @@ def numbers_of(batches: list[CsiBatch]) -> list[int]:
     return np.concatenate([b.packets.bfee_count for b in batches]).tolist() if batches else []
 
 
-async def answered(line: Line, kind: type) -> Started | Stopped | Abort:
-    """The next answer, which must be of this kind."""
-    answers: list[Started | Stopped | Abort] = []
-
-    def come() -> bool:
-        answers.extend(line.heard())
-        return bool(answers)
-
-    await until(come, f"an answer of the agent ({kind.__name__})")
-    assert isinstance(answers[0], kind), answers
-    return answers[0]
-
-
-async def send(card: Card, times: int, n: int = 20) -> None:
-    """n packets every 20 ms."""
-    for _ in range(times):
-        card.send(n)
-        await asyncio.sleep(0.02)
-
-
 async def test_what_the_card_hears_arrives_at_the_hub_in_its_time(tmp_path: Path) -> None:
     port, card = free_port(), Card(tmp_path / "csi.fifo")
     with router(port) as session:
@@ -55,48 +44,56 @@ async def test_what_the_card_hears_arrives_at_the_hub_in_its_time(tmp_path: Path
             with agents.leading(remote, "s") as line:
                 await send(card, 10)
                 await until(lambda: agents.health.counters["packets"] == 200, "all packets")
+                await until(lambda: remote.clock_error_ns < SECOND_NS / 100, "the clock is known well")
                 batches = line.batches()
             assert numbers_of(batches) == list(range(200))
             packets = batches[0].packets
             assert (packets.mac == mac_from_text(MAC)).all()
             assert packets.csi.shape[1:] == (30, 3, 2)
             assert remote.id == "attic"
-            assert remote.heard_per_s(time.monotonic_ns()) == 100.0
-            assert remote.clock_error_ns < SECOND_NS / 100
+            last = [int(batch.packets.arrival_ns[-1]) for batch in batches]
+            recent = [b for b, t_ns in zip(batches, last, strict=True) if last[-1] - t_ns <= HEARD_OVER_NS]
+            assert remote.heard_per_s(last[-1]) == sum(len(batch.packets) for batch in recent) / 2
             assert agents.health.state == "ok"
-            (reply,) = session.get(KEYS.agent_alive("attic"), timeout=5.0)
+            (reply,) = session.get(KEYS.agent_alive("attic"), timeout=40.0)
             assert decode_info(reply.ok.payload.to_bytes()).mac == MAC
-            tokens = list(session.liveliness().get(KEYS.agent_alive(), timeout=5.0))
+            tokens = list(session.liveliness().get(KEYS.agent_alive(), timeout=40.0))
             assert [str(t.ok.key_expr) for t in tokens] == [KEYS.agent_alive("attic")]
     card.close()
 
 
-async def test_a_session_is_acknowledged_with_clock_and_first_packet(tmp_path: Path) -> None:
+async def test_a_session_is_acknowledged_with_clock_and_first_packet(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     port, card = free_port(), Card(tmp_path / "csi.fifo")
     with router(port) as session:
-        async with hearing(session) as agents, running_node(port, tmp_path / "csi.fifo"):
+        async with hearing(session) as agents, running_node(port, tmp_path / "csi.fifo") as node:
             remote = await there(agents)
+            await good_clock(node)
+            # What is known of the clock stays as it is: between a session's start and the sending of its
+            # first packets it might become a little better known.
+            monkeypatch.setattr("vad.agent.offset.SLEW", 0.0)
+            monkeypatch.setattr("vad.agent.offset.STEP_NS", SECOND_NS)
             with agents.leading(remote, "s") as line:
                 line.say([Start("s", 0)])
-                await until(lambda: agents.health.counters["packets"] == 0, "nothing yet")
-                await send(card, 20)
-                started = await answered(line, Started)
-                assert isinstance(started, Started)
-                times = np.concatenate([b.packets.arrival_ns for b in line.batches()])
-                assert started.first_frame_ns in times.tolist()
-                line.say([Going("s"), Going("s")])
-                again = await answered(line, Started)
-                assert isinstance(again, Started)
-                assert again.first_frame_ns == started.first_frame_ns
-                line.heard()
-                line.say([Stop("s")])
-                stopped = await answered(line, Stopped)
-                assert isinstance(stopped, Stopped)
+                await until(lambda: node.collector.recording, "the agent is armed")
+                async with running(send(card)):
+                    (started,) = await answered(line)
+                    assert isinstance(started, Started), started
+                    times = np.concatenate([b.packets.arrival_ns for b in line.batches()])
+                    assert started.first_frame_ns in times.tolist()
+                    line.say([Going("s"), Going("s")])
+                    for again in await answered(line, 2):
+                        assert isinstance(again, Started), again
+                        assert again.first_frame_ns == started.first_frame_ns
+                    line.say([Stop("s")])
+                    (stopped,) = await answered(line)
+                assert isinstance(stopped, Stopped), stopped
                 assert 0 < stopped.frames <= card.sent
                 assert stopped.first_frame_ns == started.first_frame_ns
                 assert stopped.last_frame_ns > started.first_frame_ns
                 line.say([Start("s", 0), Stop("s")])
-                assert await answered(line, Stopped) == stopped, "an ended session does not begin again"
+                assert await answered(line) == [stopped], "an ended session does not begin again"
                 assert line.lost() == 0
     card.close()
 
@@ -106,10 +103,12 @@ async def test_a_recording_that_the_hub_knows_nothing_of_is_ended(tmp_path: Path
     with router(port) as session:
         async with hearing(session) as agents, running_node(port, tmp_path / "csi.fifo") as node:
             await there(agents)
+            await good_clock(node)
             agents.command("attic", Start("lost", 0))
             await until(lambda: node.collector.recording, "it has begun")
-            await send(card, 5)
-            await until(lambda: not node.collector.recording, "the hub calls it off", 2.0)
+            async with running(send(card)):
+                await until(lambda: not node.collector.recording, "the hub calls it off")
+            assert "the hub does not know this session" in node.collector._followers["lost"].reason
     card.close()
 
 
@@ -122,8 +121,8 @@ async def test_a_card_that_cannot_be_read_is_told_with_its_reason(tmp_path: Path
             await until(lambda: "attic: Cannot read" in agents.health.detail, "it shows in the status")
             with agents.leading(remote, "s") as line:
                 line.say([Start("s", 0)])
-                told = await answered(line, Abort)
-                assert isinstance(told, Abort)
+                (told,) = await answered(line)
+                assert isinstance(told, Abort), told
                 assert "Cannot read the CSI log" in told.reason
 
 
@@ -146,7 +145,7 @@ async def test_nothing_is_lost_through_a_short_break(tmp_path: Path) -> None:
                 await until(lambda: agents.health.counters["packets"] == card.sent, "all packets")
                 assert numbers_of(line.batches()) == list(range(card.sent))
                 assert line.lost() == 0
-            assert node.link.health.counters["met"] >= 2
+            await until(lambda: node.link.health.counters["met"] >= 2, "it met the hub again")
             assert node.collector.health.counters["dropped_packets"] == 0
     card.close()
 
@@ -197,13 +196,13 @@ async def test_an_agent_starts_before_its_hub_and_outlives_it(tmp_path: Path) ->
 async def test_an_agent_that_went_away_is_said_to_be_away(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("vad.daemon.agents.SILENT_NS", SECOND_NS // 2)
     port = free_port()
     with router(port) as session:
         async with hearing(session) as agents:
             assert agents.why_away(MAC) == ""
             async with running_node(port, tmp_path / "none.fifo"):
                 await there(agents)
+            monkeypatch.setattr("vad.daemon.agents.SILENT_NS", SECOND_NS // 2)
             await until(lambda: agents.card_of(MAC) is None, "it is gone")
             assert agents.why_away(MAC) == "its agent attic is away"
             await until(lambda: agents.health.detail == "attic: away", "the status says so")

@@ -9,6 +9,9 @@ from hypothesis import strategies as st
 
 from vad.agent.offset import SLEW, STEP_NS, ClockOffset
 
+pytestmark = pytest.mark.timeout(600)
+"""Much work for the processor: a busy machine takes many times as long as an idle one."""
+
 OFFSET_NS = 987_654_321_000_000
 
 

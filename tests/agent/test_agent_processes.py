@@ -159,7 +159,7 @@ async def a_walk(agents: Agents, network: subprocess.Popen[str], card: Card) -> 
     with agents.leading(remote, "s") as line:
         async with radio(card, 1000):
             recording = asyncio.create_task(walk.record(line, finish))
-            await until(lambda: walk.wifi.state != "armed", "everybody records")
+            await until(lambda: walk.wifi.state == "recording" or recording.done(), "everybody records")
             for word, lasts_s in (("mend", 3.0), ("cut", 3.0), ("mend", 6.0)):
                 assert network.stdin is not None
                 network.stdin.write(word + "\n")
@@ -192,10 +192,12 @@ async def test_a_session_through_a_network_that_delays_and_breaks(tmp_path: Path
     assert (np.diff(numbers) % 65536 == 1).all(), "complete, each once and in order"
     times = np.concatenate([batch.packets.arrival_ns for batch in walk.batches])
     first = walk.wifi.first_ns("attic")
-    assert first in times.tolist()
+    assert first is not None
+    # The agent knew the clock as well when it began, and may know it a little better since.
+    assert np.abs(times - first).min() < GOOD_CLOCK_NS
     assert (times[-1] - times[0]) / 1e9 > 11
     assert np.diff(times).max() < 2e9, "there is no hole where the network broke"
-    assert (times >= first).sum() >= walk.wifi.recorded("attic") > 10_000
+    assert (times >= first - GOOD_CLOCK_NS).sum() >= walk.wifi.recorded("attic") > 10_000
     offset_ns = -CLOCK_AHEAD_S * 10**9 if other_clock() else 0
     with_packets = [frame for frame in frames if frame.packets]
     errors_ms = np.abs([frame.offset_ns - offset_ns for frame in with_packets]) / 1e6

@@ -27,6 +27,9 @@ from vad.agent.outbox import AGAIN_NS, WINDOW_FRAMES, Draft, Outbox
 from vad.capture.handshake import Abort, Going, Start, Started, Stop, Stopped
 from vad.errors import ProtocolError
 
+pytestmark = pytest.mark.timeout(600)
+"""Much work for the processor: a busy machine takes many times as long as an idle one."""
+
 RECORD = 213
 STREAM = 77
 MAC = "00:16:ea:00:00:01"

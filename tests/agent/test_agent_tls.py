@@ -8,14 +8,32 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
-from agent_world import HUB, KEYS, Card, hearing, router, running_node, there
-from waiting import free_port, until
+import zenoh
+from agent_world import (
+    HUB,
+    KEYS,
+    Card,
+    answered,
+    good_clock,
+    hearing,
+    router,
+    running_node,
+    send,
+    there,
+)
+from waiting import free_port, running, until
 
+from vad.agent.frames import VERSION, Frame, encode_frame
 from vad.bus.gate import Gate, GateSettings
+from vad.bus.session import BusSettings, open_session
 from vad.capture.handshake import Start, Started
+from vad.daemon.agents import Agents
 from vad.pki.certificates import CLIENT_DAYS, utc_now
 from vad.pki.credentials import write_credentials
 from vad.pki.folder import PkiFolder
+
+pytestmark = pytest.mark.timeout(300)
+"""Processes are started, and waited for one after the other: a busy machine takes its time for each."""
 
 
 @contextlib.asynccontextmanager
@@ -31,7 +49,7 @@ async def gate(folder: Path, port: int, tls: str, *names: str) -> AsyncIterator[
     way_in = Gate(GateSettings(HUB, (tls,), f"tcp/127.0.0.1:{port}"), pki)
     task = asyncio.create_task(way_in.run())
     try:
-        await until(lambda: way_in.health.counters["opened"] > 0, "the gate is open")
+        await until(lambda: way_in.health.counters["opened"] > 0, "the gate is open", 120.0)
         yield folders
     finally:
         task.cancel()
@@ -39,8 +57,40 @@ async def gate(folder: Path, port: int, tls: str, *names: str) -> AsyncIterator[
             await task
 
 
+def frame(name: str, mac: str) -> bytes:
+    """A sign of life of an agent whose card has this address."""
+    return encode_frame(
+        Frame(
+            version=VERSION,
+            stream=len(name),
+            seq=0,
+            oldest=0,
+            before=0,
+            given_up=0,
+            offset_ns=0,
+            error_ns=0,
+            mac=mac,
+            carrier_hz=5.2e9,
+            bandwidth_mhz=20,
+        )
+    )
+
+
+@contextlib.asynccontextmanager
+async def client(tls: str, credentials: Path) -> AsyncIterator[zenoh.Session]:
+    """A session of somebody's own."""
+    settings = BusSettings(hub=HUB, mode="client", connect=(tls,), credentials=credentials)
+    session = await asyncio.to_thread(open_session, settings)
+    try:
+        yield session
+    finally:
+        await asyncio.to_thread(session.close)
+
+
 @pytest.mark.slow
-async def test_an_agent_comes_in_with_its_own_certificate_and_under_no_other_name(tmp_path: Path) -> None:
+async def test_an_agent_comes_in_with_its_own_certificate_and_under_no_other_name(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     port, card = free_port(), Card(tmp_path / "csi.fifo")
     tls = f"tls/127.0.0.1:{free_port()}"
     with router(port) as session:
@@ -50,26 +100,39 @@ async def test_an_agent_comes_in_with_its_own_certificate_and_under_no_other_nam
             running_node(tls, tmp_path / "csi.fifo", credentials=attic) as node,
         ):
             remote = await there(agents)
-            for _ in range(10):
-                card.send(20)
-                await asyncio.sleep(0.02)
+            await good_clock(node)
+            await send(card, 10)
             await until(lambda: agents.health.counters["packets"] == card.sent, "all packets")
             with agents.leading(remote, "s") as line:
                 line.say([Start("s", 0)])
                 await until(lambda: node.collector.recording, "the agent hears commands")
-                card.send(20)
-                await asyncio.sleep(0.1)
-                card.send(20)
-                answers: list[object] = []
-                await until(lambda: bool(answers.extend(line.heard()) or answers), "and answers")
-                assert isinstance(answers[0], Started)
-            (token,) = session.liveliness().get(KEYS.agent_alive(), timeout=5.0)
+                async with running(send(card)):
+                    (started,) = await answered(line)
+                assert isinstance(started, Started), started
+            (token,) = session.liveliness().get(KEYS.agent_alive(), timeout=40.0)
             assert str(token.ok.key_expr) == KEYS.agent_alive("attic")
-            async with running_node(
-                tls, tmp_path / "x.fifo", mac="00:16:ea:00:00:02", credentials=cellar
-            ) as thief:
-                await until(lambda: thief.link.health.counters["met"] > 0, "it may see that the hub is there")
-                await asyncio.sleep(3.0)  # more than a sign of life
-                assert agents.card_of("00:16:ea:00:00:02") is None
-                assert not thief.collector.clock.known
+            await no_other_name(agents, tls, cellar, tmp_path, caplog)
     card.close()
+
+
+async def no_other_name(
+    agents: Agents, tls: str, cellar: Path, folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """With the cellar's certificate nobody is the attic."""
+    thief_mac, own_mac = "00:16:ea:00:00:02", "00:16:ea:00:00:03"
+    async with running_node(tls, folder / "x.fifo", mac=thief_mac, credentials=cellar) as thief:
+        await until(lambda: thief.link.health.counters["met"] > 0, "it may see that the hub is there")
+        stopped = f"may not Query on '{KEYS.agent_clock('attic')}'"
+        await until(lambda: stopped in caplog.text, "the gate stops its question for the hub's time")
+        assert not thief.collector.clock.known
+    async with client(tls, cellar) as own:
+
+        def own_arrives() -> bool:
+            own.put(KEYS.agent_csi("attic"), frame("attic", thief_mac))
+            own.put(KEYS.agent_csi("cellar"), frame("cellar", own_mac))
+            return agents.card_of(own_mac) is not None
+
+        await until(own_arrives, "what it says for itself arrives")
+        assert agents.card_of(thief_mac) is None, "what it said for the attic before did not"
+        stopped = f"may not Put on '{KEYS.agent_csi('attic')}'"
+        await until(lambda: stopped in caplog.text, "the gate stopped it")

@@ -10,6 +10,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from waiting import free_port
 
 _FRAGMENT = 1200
 _CLOCK_HZ = 90_000
@@ -22,7 +23,7 @@ class RtspServer:
     """
 
     def __init__(self, picture: Callable[[int], NDArray[np.uint8]], *, fps: float = 25.0) -> None:
-        self.port = 0
+        self.port = free_port()  # nobody else's while it is closed, either
         self.sent: list[tuple[int, int]] = []
         self.requests: list[str] = []
         self._picture = picture
@@ -41,7 +42,6 @@ class RtspServer:
 
     async def listen(self) -> None:
         self._server = await asyncio.start_server(self._serve, "127.0.0.1", self.port)
-        self.port = self._server.sockets[0].getsockname()[1]
 
     async def close(self) -> None:
         """Stop listening and break every connection."""

@@ -18,6 +18,9 @@ from vad.config import parse_settings
 from vad.errors import ConfigError
 from vad.geometry import Intrinsics, Rigid, rotation_from_vector, undistort
 
+pytestmark = pytest.mark.timeout(600)
+"""Much work for the processor: a busy machine takes many times as long as an idle one."""
+
 Image = NDArray[np.uint8]
 LENS = Intrinsics(640, 480, 455.0, 452.0, 326.0, 233.0, -0.21, 0.05)
 SQUARE_PX = 60

@@ -6,14 +6,17 @@ import asyncio
 import base64
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from functools import partial
 
 import cv2
 import numpy as np
 import pytest
 from camera_world import running
-from waiting import until
+from waiting import free_port, until
 
+from vad.camera import stamps
 from vad.camera.frame import Frame, FrameQueue
 from vad.camera.http_stream import HttpStreamCamera, decode_jpeg
 from vad.errors import ConfigError
@@ -27,7 +30,7 @@ def jpeg(value: int, width: int = 64, height: int = 48) -> bytes:
 
 
 async def next_frame(out: FrameQueue) -> Frame:
-    async with asyncio.timeout(5.0):
+    async with asyncio.timeout(40.0):
         return await out.get()
 
 
@@ -39,7 +42,11 @@ async def next_frame(out: FrameQueue) -> Frame:
         ("ustreamer", "", "wall", False),
     ],
 )
-async def test_pictures_come_with_their_times(style: Style, query: str, source: str, exact: bool) -> None:
+async def test_pictures_come_with_their_times(
+    monkeypatch: pytest.MonkeyPatch, style: Style, query: str, source: str, exact: bool
+) -> None:
+    # A stamp older than 2 s is no camera's, but may be a busy machine's; what is too old has its own test.
+    monkeypatch.setattr(stamps, "is_plausible", partial(stamps.is_plausible, oldest_ns=60_000_000_000))
     async with MjpegServer("127.0.0.1", 0, style=style) as server:
         camera = HttpStreamCamera(server.url + query)
         async with running(camera) as out:
@@ -107,21 +114,33 @@ async def test_a_slow_client_misses_pictures_and_another_does_not_wait() -> None
         stuck.transport.abort()
 
 
-async def raw_server(answer: Callable[[bytes], bytes]) -> tuple[asyncio.Server, int, list[bytes]]:
+@asynccontextmanager
+async def raw_server(answer: Callable[[bytes], bytes]) -> AsyncIterator[tuple[int, list[bytes]]]:
+    """A server of these bytes: its port, and what it was asked. At the end it has done with every client."""
     requests: list[bytes] = []
+    clients: set[asyncio.Task[None]] = set()
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        request = await reader.readuntil(b"\r\n\r\n")
-        requests.append(request)
-        writer.write(answer(request))
-        await writer.drain()
-        # A stream stays open until the client goes; everything else ends with its answer.
-        if b"multipart" in answer(request):
-            await reader.read()
-        writer.close()
+        try:
+            request = await reader.readuntil(b"\r\n\r\n")
+            requests.append(request)
+            writer.write(answer(request))
+            await writer.drain()
+            # A stream stays open until the client goes; everything else ends with its answer.
+            if b"multipart" in answer(request):
+                await reader.read()
+        except (OSError, asyncio.IncompleteReadError):
+            return  # the client went first
+        finally:
+            writer.close()
 
-    server = await asyncio.start_server(serve, "127.0.0.1", 0)
-    return server, server.sockets[0].getsockname()[1], requests
+    def accept(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        clients.add(asyncio.create_task(serve(reader, writer)))
+
+    async with await asyncio.start_server(accept, "127.0.0.1", 0) as server:
+        yield server.sockets[0].getsockname()[1], requests
+        server.close()
+        await asyncio.gather(*clients)
 
 
 async def test_esp32_chunks_and_login() -> None:
@@ -136,13 +155,14 @@ async def test_esp32_chunks_and_login() -> None:
         b"HTTP/1.1 200 OK\r\nContent-Type: multipart/x-mixed-replace;boundary=12345\r\n"
         b"Transfer-Encoding: chunked\r\n\r\n"
     )
-    server, port, requests = await raw_server(lambda _: head + chunks)
-    async with server:
+    before_ns = time.monotonic_ns()
+    async with raw_server(lambda _: head + chunks) as (port, requests):
         camera = HttpStreamCamera(f"http://me:p%40ss@127.0.0.1:{port}/cam?x=1")
         async with running(camera) as out:
             frame = await next_frame(out)
             assert abs(int(frame.image.mean()) - 77) <= 2
-            assert time.monotonic_ns() - frame.t_ns < 5_000_000_000
+            # The ESP32's stamp, seconds since its own start, is none: when it came counts.
+            assert before_ns <= frame.t_ns <= time.monotonic_ns()
     assert requests[0].startswith(b"GET /cam?x=1 HTTP/1.1\r\n")
     assert b"Authorization: Basic " + base64.b64encode(b"me:p@ss") in requests[0]
 
@@ -158,8 +178,7 @@ async def test_esp32_chunks_and_login() -> None:
     ],
 )
 async def test_bad_answers_are_told(answer: bytes, reason: str) -> None:
-    server, port, _ = await raw_server(lambda _: answer)
-    async with server:
+    async with raw_server(lambda _: answer) as (port, _):
         camera = HttpStreamCamera(f"http://127.0.0.1:{port}/")
         async with running(camera):
             await until(lambda: camera.health.state == "degraded")
@@ -168,10 +187,7 @@ async def test_bad_answers_are_told(answer: bytes, reason: str) -> None:
 
 
 async def test_nobody_listens() -> None:
-    server, port, _ = await raw_server(lambda _: b"")
-    server.close()
-    await server.wait_closed()
-    camera = HttpStreamCamera(f"http://127.0.0.1:{port}/")
+    camera = HttpStreamCamera(f"http://127.0.0.1:{free_port()}/")
     async with running(camera):
         await until(lambda: camera.health.state == "degraded")
 

@@ -45,12 +45,15 @@ class Handle:
     def __init__(self, device: Device) -> None:
         self.device = device
         self.tick = threading.Event()
+        self.stamp_ms = 0.0
 
     def isOpened(self) -> bool:  # noqa: N802
         return True
 
     def grab(self) -> bool:
         self.tick.wait(0.005)
+        # As a driver's: from before the picture is handed over, however late its time is asked for.
+        self.stamp_ms = self.device.stamp_ms()
         return self.device.plugged.is_set()
 
     def retrieve(self) -> tuple[bool, Any]:
@@ -63,7 +66,7 @@ class Handle:
         if prop == cv2.CAP_PROP_FOURCC:
             return float(cv2.VideoWriter.fourcc(*"YUYV"))
         assert prop == cv2.CAP_PROP_POS_MSEC
-        return self.device.stamp_ms()
+        return self.stamp_ms
 
     def set(self, prop: int, value: float, /) -> bool:
         self.device.settings.append((prop, value))
@@ -81,10 +84,11 @@ async def test_driver_stamps_unplug_and_replug() -> None:
     device = Device(lambda: monotonic_ms() - 30.0)
     camera = V4l2Camera(V4l2Settings("/dev/video9", 64, 48, 30.0), opener=device.open)
     out = FrameQueue(1000)
+    before_ns = time.monotonic_ns()
     task = asyncio.create_task(camera.run(out))
     await until(lambda: len(out) >= 3)
     frame = out.drain()[-1]
-    assert 25_000_000 < time.monotonic_ns() - frame.t_ns < 2_000_000_000
+    assert before_ns - 30_000_000 <= frame.t_ns < time.monotonic_ns() - 25_000_000
     assert camera.health.detail == "64x48 YUYV, stamps: driver"
     assert device.settings[0] == (cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG"))
     assert (cv2.CAP_PROP_FRAME_WIDTH, 64) in device.settings
@@ -100,8 +104,9 @@ async def test_driver_stamps_unplug_and_replug() -> None:
     assert seqs == sorted(set(seqs))
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
+    # It waits for its thread for a second at most; on a busy machine that ends a little later.
+    await until(lambda: not [t for t in threading.enumerate() if t.name.startswith("v4l2")])
     assert device.open_handles == 0
-    assert not [t for t in threading.enumerate() if t.name.startswith("v4l2")]
 
 
 @pytest.mark.parametrize("stamp_ms", [0.0, 12345.0, 1e15, -1.0])
@@ -109,10 +114,11 @@ async def test_stamps_of_another_clock_are_replaced_by_the_arrival(stamp_ms: flo
     device = Device(lambda: stamp_ms if stamp_ms != 12345.0 else monotonic_ms() - 60_000.0)
     camera = V4l2Camera(V4l2Settings("/dev/video9"), opener=device.open)
     out = FrameQueue(10)
+    before_ns = time.monotonic_ns()
     task = asyncio.create_task(camera.run(out))
-    async with asyncio.timeout(5.0):
+    async with asyncio.timeout(40.0):
         frame = await out.get()
-    assert 0 <= time.monotonic_ns() - frame.t_ns < 2_000_000_000
+    assert before_ns <= frame.t_ns <= time.monotonic_ns()
     assert camera.health.counters["arrival_stamps"] >= 1
     assert camera.health.detail.endswith("arrival")
     task.cancel()
@@ -120,12 +126,13 @@ async def test_stamps_of_another_clock_are_replaced_by_the_arrival(stamp_ms: flo
 
 
 async def test_a_trusted_driver_is_believed_when_its_pictures_come_late() -> None:
-    # The first is as late as a stranger's may be; as its buffers fill, each of the next is later by some ms.
+    # The first is nearly as late as a stranger's may be; as its buffers fill, each of the next is later by
+    # some ms.
     first_ms, pictures = 0.0, 0
 
     def stamp_ms() -> float:
         nonlocal first_ms, pictures
-        first_ms = first_ms or monotonic_ms() - 1900.0
+        first_ms = first_ms or monotonic_ms() - 1200.0
         pictures += 1
         return first_ms + 0.1 * pictures
 
@@ -134,22 +141,26 @@ async def test_a_trusted_driver_is_believed_when_its_pictures_come_late() -> Non
     out = FrameQueue(1000)
     task = asyncio.create_task(camera.run(out))
     await until(lambda: time.monotonic_ns() - out.drain()[-1].t_ns > 2_200_000_000 if len(out) else False)
+    await until(lambda: camera.health.counters["frames"] >= 3)
     assert camera.health.counters["arrival_stamps"] == 0
-    assert camera.health.counters["frames"] >= 3
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
 
 
 async def test_only_what_is_wanted_is_decoded() -> None:
-    device = Device(monotonic_ms)
+    # A picture every 5 ms by the driver's stamps, whenever it comes: it takes longer, never less.
+    first_ms, pictures = monotonic_ms(), itertools.count()
+    device = Device(lambda: first_ms + 5.0 * next(pictures))
     out = FrameQueue(1000)
     out.step_ns = 50_000_000
     camera = V4l2Camera(V4l2Settings("/dev/video9"), opener=device.open)
     task = asyncio.create_task(camera.run(out))
     await until(lambda: len(out) >= 6)
+    # The camera goes on meanwhile: what is decoded now is in the queue a little later.
+    decoded = device.decoded
+    await until(lambda: len(out) >= decoded, "every decoded picture is a wanted one")
     times = [frame.t_ns for frame in out.drain()]
     assert min(b - a for a, b in itertools.pairwise(times)) >= out.step_ns
-    assert device.decoded <= len(times) + 1
     assert camera.health.counters["unwanted"] > len(times)
     out.step_ns = 0
     await until(lambda: len(out) >= 6)

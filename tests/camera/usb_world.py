@@ -32,7 +32,8 @@ class Kinect(usb.backend.IBackend):  # type: ignore[misc]
     """The device and its bus. `plug(False)` unplugs it; `send` queues a picture once it streams.
 
     Attributes: serial; log: what the host did, in order; streaming; busy_polls: READY says no so often;
-    aborts: the host did what ends its process with some versions of libusb.
+    transfers: of colour, how many the host took; aborts: the host did what ends its process with some
+    versions of libusb.
     """
 
     def __init__(self, serial: str = "012345678947", product: int = 0x02C4) -> None:
@@ -41,6 +42,7 @@ class Kinect(usb.backend.IBackend):  # type: ignore[misc]
         self.log: list[tuple[Any, ...]] = []
         self.streaming = threading.Event()
         self.busy_polls = 2
+        self.transfers = 0
         self.forbidden = False
         self.aborts = False
         self._plugged = True
@@ -196,6 +198,7 @@ class Kinect(usb.backend.IBackend):  # type: ignore[misc]
                     raise usb.core.USBTimeoutError("timed out", -7, errno.ETIMEDOUT)
                 self._change.wait(left)
             data = queue.popleft()
+        self.transfers += endpoint == 0x83
         assert len(data) <= len(buffer), "the host's buffer would overflow"
         buffer[: len(data)] = array.array("B", data)
         return len(data)

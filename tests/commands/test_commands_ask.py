@@ -6,7 +6,6 @@ import asyncio
 import json
 import re
 import signal
-import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +15,7 @@ import numpy as np
 import pytest
 import typer
 from typer.testing import CliRunner
+from waiting import free_port, until
 
 from vad.bus import messages as m
 from vad.bus.grid import grid_to_png
@@ -42,9 +42,7 @@ app.command("heatmap")(heatmap)
 @pytest.fixture
 def endpoint() -> str:
     """An endpoint where nobody listens."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return f"tcp/127.0.0.1:{free_port()}"
 
 
 async def run(endpoint: str, *arguments: str, code: int = 0) -> tuple[str, str]:
@@ -337,11 +335,14 @@ async def watching(endpoint: str, *arguments: str) -> asyncio.subprocess.Process
     )  # fmt: skip
 
 
-async def asked_twice(bus: Bus) -> None:
-    """Wait until the second question came: the answer to the first has been shown by then."""
-    async with asyncio.timeout(20):
-        while bus.health.counters["queries"] < 2:  # noqa: ASYNC110 - the counter is no event
-            await asyncio.sleep(0.02)
+async def shown(bus: Bus) -> None:
+    """Wait until what is published now has been shown.
+
+    The first question that is answered from now on may have been asked before, and the answer to the second
+    is shown for sure when the third is asked.
+    """
+    asked = bus.health.counters["queries"]
+    await until(lambda: bus.health.counters["queries"] >= asked + 3, "three questions")
 
 
 async def test_watching_shows_changes_and_ends_with_ctrl_c(endpoint: str) -> None:
@@ -349,13 +350,13 @@ async def test_watching_shows_changes_and_ends_with_ctrl_c(endpoint: str) -> Non
         fill(bus)
         process = await watching(endpoint, "--json")
         assert process.stdout is not None
-        first = json.loads(await asyncio.wait_for(process.stdout.readline(), 20))
+        first = json.loads(await asyncio.wait_for(process.stdout.readline(), 40))
         assert [one["state"] for one in first] == ["mapped", "mapped", "waiting"]
         bus.publish_device(m.DeviceMessage(source="simulated", mac=PHONE, state="capturing"))
-        second = json.loads(await asyncio.wait_for(process.stdout.readline(), 20))
+        second = json.loads(await asyncio.wait_for(process.stdout.readline(), 40))
         assert second[2]["state"] == "capturing"
         process.send_signal(signal.SIGINT)
-        rest, complaint = await asyncio.wait_for(process.communicate(), 20)
+        rest, complaint = await asyncio.wait_for(process.communicate(), 40)
         assert (process.returncode, rest, complaint) == (0, b"", b"")
 
 
@@ -363,13 +364,13 @@ async def test_a_watched_table_outlives_the_daemon(endpoint: str) -> None:
     async with Bus(BusSettings(listen=(endpoint,))) as bus:
         fill(bus)
         process = await watching(endpoint)
-        await asked_twice(bus)
+        await shown(bus)
     async with Bus(BusSettings(listen=(endpoint,))) as bus:
         bus.publish_device(m.DeviceMessage(source="live", mac=PHONE, name="back again", state="waiting"))
-        await asked_twice(bus)
+        await shown(bus)
         assert process.returncode is None
         process.send_signal(signal.SIGINT)
-        text, _ = await asyncio.wait_for(process.communicate(), 20)
+        text, _ = await asyncio.wait_for(process.communicate(), 40)
         assert process.returncode == 0
         assert "back again" in text.decode()
 

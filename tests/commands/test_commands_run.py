@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 import yaml
 from typer.testing import CliRunner
+from waiting import free_port
 
 from vad.commands.app import app
 from vad.robot.map_server import save_floor_plan
@@ -26,9 +27,6 @@ ROOT = Path(__file__).parents[2]
 def settings(tmp_path: Path) -> dict[str, Any]:
     """Usable settings, beside a floor plan in `tmp_path`; nothing they name needs to be there to start."""
     save_floor_plan(floor_plan(make_home(1)), tmp_path / "floor.yaml")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
     return {
         "state_dir": "state",
         "map": {"file": "floor.yaml"},
@@ -36,7 +34,7 @@ def settings(tmp_path: Path) -> dict[str, Any]:
         "camera": {"source": {"type": "mjpeg", "url": "http://127.0.0.1:9/stream"}},
         "radio": {"source": {"type": "follow", "path": "csi.fifo"}},
         "devices": {"hostapd": ["hostapd.sock"]},
-        "bus": {"listen": [f"tcp/127.0.0.1:{port}"]},
+        "bus": {"listen": [f"tcp/127.0.0.1:{free_port()}"]},
     }
 
 
@@ -57,7 +55,7 @@ def check(path: Path, code: int) -> str:
 def run(path: Path, code: int = 2) -> str:
     """What `vad run` says before it gives up, as one line."""
     done = subprocess.run(
-        [sys.executable, "-m", "vad", "run", "--config", path], cwd=ROOT, capture_output=True, timeout=30
+        [sys.executable, "-m", "vad", "run", "--config", path], cwd=ROOT, capture_output=True, timeout=50
     )
     said = done.stderr.decode()
     assert done.returncode == code, said

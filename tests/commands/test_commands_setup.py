@@ -198,7 +198,7 @@ def talk(
             if answers and answers[0][0].encode() in shown[seen:]:
                 seen = len(shown)
                 os.write(master, answers.pop(0)[1].encode() + b"\n")
-        return program.wait(5), shown
+        return program.wait(15), shown
     finally:
         if program.poll() is None:
             program.kill()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import socket
 import time
 from collections.abc import Iterator
@@ -10,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from csi_tools import bodies, running
-from waiting import until
+from waiting import free_group, until
 
 from vad.csi import cn
 from vad.csi.connector import Connector
@@ -23,29 +22,28 @@ from vad.mac import UNKNOWN_MAC
 AP, STATION = 0x02_00_00_00_00_FF, 0x02_00_00_00_00_01
 
 
-def group_of_this_process() -> int:
-    """Test processes and simulated homes on one kernel must not hear each other: a group each."""
-    return 11 + os.getpid() % 14
-
-
-GROUP = group_of_this_process()
-
-
 class Sender:
-    """Multicasts to the connector's group from this process."""
+    """Multicasts to a group of the connector from this process."""
 
-    def __init__(self, sock: socket.socket) -> None:
+    def __init__(self, sock: socket.socket, group: int) -> None:
         self.sock = sock
+        self.group = group
 
     def send(self, message: bytes) -> None:
-        self.sock.sendto(message, (0, 1 << GROUP - 1))
+        self.sock.sendto(message, (0, 1 << self.group - 1))
 
     def record(self, code: int, body: bytes) -> None:
-        self.send(cn.build_message(code, body, group=GROUP))
+        self.send(cn.build_message(code, body, group=self.group))
+
+
+@pytest.fixture(scope="module")
+def group() -> int:
+    """Test processes and simulated homes on one kernel must not hear each other: a group each."""
+    return free_group()
 
 
 @pytest.fixture
-def sender() -> Iterator[Sender]:
+def sender(group: int) -> Iterator[Sender]:
     try:
         sock = socket.socket(socket.AF_NETLINK, socket.SOCK_DGRAM, cn.NETLINK_CONNECTOR)
     except OSError as error:
@@ -53,16 +51,16 @@ def sender() -> Iterator[Sender]:
     with sock:
         sock.bind((0, 0))
         try:
-            sock.setsockopt(cn.SOL_NETLINK, cn.NETLINK_ADD_MEMBERSHIP, GROUP)
-            sock.setsockopt(cn.SOL_NETLINK, 2, GROUP)  # NETLINK_DROP_MEMBERSHIP
-            sock.sendto(cn.build_message(0, b"", group=GROUP), (0, 1 << GROUP - 1))
+            sock.setsockopt(cn.SOL_NETLINK, cn.NETLINK_ADD_MEMBERSHIP, group)
+            sock.setsockopt(cn.SOL_NETLINK, 2, group)  # NETLINK_DROP_MEMBERSHIP
+            sock.sendto(cn.build_message(0, b"", group=group), (0, 1 << group - 1))
         except PermissionError:
             pytest.skip("joining and sending to connector groups needs CAP_NET_ADMIN")
-        yield Sender(sock)
+        yield Sender(sock, group)
 
 
 async def test_records_arrive_byte_for_byte_and_attributed(sender: Sender) -> None:
-    source = Connector(GROUP, allow_user_space=True)
+    source = Connector(sender.group, allow_user_space=True)
     async with running(source) as out:
         log = b""
         for i, body in enumerate(bodies(300)):
@@ -80,7 +78,7 @@ async def test_records_arrive_byte_for_byte_and_attributed(sender: Sender) -> No
 
 
 async def test_arrival_times_follow_the_nic_not_the_drain(sender: Sender) -> None:
-    source = Connector(GROUP, allow_user_space=True)
+    source = Connector(sender.group, allow_user_space=True)
     async with running(source) as out:
         before = time.monotonic_ns()
         for body in bodies(50):
@@ -93,7 +91,7 @@ async def test_arrival_times_follow_the_nic_not_the_drain(sender: Sender) -> Non
 
 
 async def test_an_overrun_is_counted_exactly_and_makes_the_sender_unknown(sender: Sender) -> None:
-    source = Connector(GROUP, allow_user_space=True, receive_buffer_bytes=40_000)
+    source = Connector(sender.group, allow_user_space=True, receive_buffer_bytes=40_000)
     async with running(source) as out:
         sent = 0
         # Sent while the event loop stands still: nobody drains.
@@ -117,7 +115,7 @@ async def test_an_overrun_is_counted_exactly_and_makes_the_sender_unknown(sender
 
 
 async def test_a_burst_while_the_loop_stands_still_is_kept(sender: Sender) -> None:
-    source = Connector(GROUP, allow_user_space=True)
+    source = Connector(sender.group, allow_user_space=True)
     async with running(source) as out:
         for body in bodies(3000):
             sender.record(0xBB, body)
@@ -127,7 +125,7 @@ async def test_a_burst_while_the_loop_stands_still_is_kept(sender: Sender) -> No
 
 
 async def test_processes_are_refused_by_default(sender: Sender, caplog: pytest.LogCaptureFixture) -> None:
-    source = Connector(GROUP)
+    source = Connector(sender.group)
     async with running(source) as out:
         for body in bodies(20):
             sender.record(0xBB, body)
@@ -138,14 +136,20 @@ async def test_processes_are_refused_by_default(sender: Sender, caplog: pytest.L
 
 
 async def test_messages_that_lie_are_refused(sender: Sender, caplog: pytest.LogCaptureFixture) -> None:
-    good = cn.build_message(0xBB, bodies(1)[0], group=GROUP)
+    good = cn.build_message(0xBB, bodies(1)[0], group=sender.group)
     longer = bytearray(good)
     longer[32:34] = (len(good)).to_bytes(2, "little")
     empty = bytearray(good)
     empty[32:34] = bytes(2)
-    source = Connector(GROUP, allow_user_space=True)
+    source = Connector(sender.group, allow_user_space=True)
     async with running(source) as out:
-        for message in (cn.build_message(0xBB, b"x", group=GROUP, value=2), longer, empty, good[:36], good):
+        for message in (
+            cn.build_message(0xBB, b"x", group=sender.group, value=2),
+            longer,
+            empty,
+            good[:36],
+            good,
+        ):
             sender.send(bytes(message))
         await until(lambda: source.health.counters["messages"] >= 5)
     counters = source.health.counters

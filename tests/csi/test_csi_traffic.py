@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import ctypes
 import errno
 import os
+import secrets
 import shutil
 import socket
 import subprocess
@@ -13,6 +15,7 @@ import sys
 import time
 from collections.abc import AsyncIterator, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import pytest
 from waiting import until
@@ -20,8 +23,9 @@ from waiting import until
 from vad.csi.traffic import EchoTraffic
 from vad.errors import VadError
 
-_TAG = os.getpid() % 0xFFFF
-_NET = f"10.213.{_TAG % 254}"
+_NET = "10.213.1"
+_CLONE_NEWNET = 0x4000_0000
+_PING_GROUPS = Path("/proc/sys/net/ipv4/ping_group_range")
 
 # Answers every echo request but a part, as a network that loses packets does.
 _POOR_ANSWERER = """
@@ -53,13 +57,32 @@ class Peer:
 
 
 def ip(*words: str) -> None:
-    subprocess.run(["ip", *words], check=True, capture_output=True, timeout=10)
+    subprocess.run(["ip", *words], check=True, capture_output=True)
+
+
+@contextlib.contextmanager
+def own_network() -> Iterator[None]:
+    """This thread has a network to itself: nobody else's addresses and interfaces are in it.
+
+    Who may send echo requests is taken over.
+    """
+    libc = ctypes.CDLL(None, use_errno=True)
+    groups = _PING_GROUPS.read_text()
+    with Path("/proc/thread-self/ns/net").open() as before:
+        if libc.unshare(_CLONE_NEWNET):
+            pytest.skip(f"no network namespaces here: {os.strerror(ctypes.get_errno())}")
+        try:
+            with contextlib.suppress(OSError):  # where /proc may not be written the kernel's own must do
+                _PING_GROUPS.write_text(groups)
+            yield
+        finally:
+            assert libc.setns(before.fileno(), _CLONE_NEWNET) == 0, os.strerror(ctypes.get_errno())
 
 
 def wait_until_it_carries(address: str) -> None:
     """Until packets go there and back: the kernel turns a new cable's queues on when it has time, and asks a
     second later for the hardware address of a device whose answer was dropped before that."""
-    until_s = time.monotonic() + 20.0
+    until_s = time.monotonic() + 40.0
     while time.monotonic() < until_s:
         with socket.socket() as probe:
             probe.settimeout(1.0)
@@ -73,33 +96,33 @@ def wait_until_it_carries(address: str) -> None:
 def peer() -> Iterator[Peer]:
     if os.geteuid() != 0 or shutil.which("ip") is None:
         pytest.skip("network namespaces need root and iproute2")
-    made = Peer(f"vadt{_TAG}", f"{_NET}.2", f"vadt{_TAG}a")
-    try:
-        ip("netns", "add", made.namespace)
-    except subprocess.CalledProcessError as error:
-        pytest.skip(f"no network namespaces here: {error.stderr.decode().strip()}")
-    try:
+    # Names of namespaces are for everybody on the machine.
+    made = Peer(f"vadt{secrets.token_hex(4)}", f"{_NET}.2", "cable")
+    with own_network():
         try:
-            ip("link", "add", made.interface, "type", "veth", "peer", "eth0", "netns", made.namespace)
+            ip("netns", "add", made.namespace)
         except subprocess.CalledProcessError as error:
-            pytest.skip(f"no veth pairs here: {error.stderr.decode().strip()}")
-        ip("addr", "add", f"{_NET}.1/24", "dev", made.interface)
-        ip("link", "set", made.interface, "up")
-        ip("-n", made.namespace, "addr", "add", f"{made.address}/24", "dev", "eth0")
-        ip("-n", made.namespace, "link", "set", "eth0", "up")
-        wait_until_it_carries(made.address)
-        yield made
-    finally:
-        ip("netns", "del", made.namespace)
-        with contextlib.suppress(subprocess.CalledProcessError):  # it went with its other end
-            ip("link", "del", made.interface)
+            pytest.skip(f"no network namespaces here: {error.stderr.decode().strip()}")
+        try:
+            try:
+                ip("link", "add", made.interface, "type", "veth", "peer", "eth0", "netns", made.namespace)
+            except subprocess.CalledProcessError as error:
+                pytest.skip(f"no veth pairs here: {error.stderr.decode().strip()}")
+            ip("addr", "add", f"{_NET}.1/24", "dev", made.interface)
+            ip("link", "set", made.interface, "up")
+            ip("-n", made.namespace, "addr", "add", f"{made.address}/24", "dev", "eth0")
+            ip("-n", made.namespace, "link", "set", "eth0", "up")
+            wait_until_it_carries(made.address)
+            yield made
+        finally:
+            ip("netns", "del", made.namespace)
 
 
 @pytest.fixture
 def poor_peer(peer: Peer) -> Iterator[Peer]:
     """The same, where three requests in ten go unanswered."""
     silent = peer.run("sysctl", "-qw", "net.ipv4.icmp_echo_ignore_all=1")
-    subprocess.run(silent, check=True, timeout=10, capture_output=True)
+    subprocess.run(silent, check=True, capture_output=True)
     answer = peer.run(sys.executable, "-c", _POOR_ANSWERER, "0.3")
     with subprocess.Popen(answer, stdout=subprocess.PIPE, text=True) as answerer:
         try:
@@ -121,15 +144,16 @@ async def sending(traffic: EchoTraffic) -> AsyncIterator[None]:
             await task
 
 
+@pytest.mark.timeout(180)
 async def test_a_device_that_answers(peer: Peer) -> None:
     traffic = EchoTraffic(peer.address, 400)
     counters = traffic.health.counters
     async with sending(traffic):
-        await until(lambda: counters["replies"] >= 300, timeout_s=10)
+        await until(lambda: counters["replies"] >= 300, "replies, be they slow", timeout_s=120)
+        # A busy machine may be late for some; in half a second when it is not, every request has its reply.
+        await until(lambda: ", 100% answered" in traffic.health.detail, "nothing is lost")
         assert traffic.health.state == "ok"
-        assert "answered" in traffic.health.detail
-    assert counters["replies"] >= counters["sent"] - 20
-    assert counters["lost"] <= 5
+    assert counters["sent"] >= counters["replies"] + counters["lost"]
     stopped_at = counters["sent"]
     await asyncio.sleep(0)
     assert counters["sent"] == stopped_at
@@ -139,16 +163,16 @@ async def test_thirty_percent_loss_brings_the_rate_down(poor_peer: Peer) -> None
     traffic = EchoTraffic(poor_peer.address, 400)
     counters = traffic.health.counters
     async with sending(traffic):
-        await until(lambda: counters["backed_off"] >= 4, timeout_s=15)
-        assert counters["replies"] > 0
-        assert counters["lost"] > 0.15 * counters["sent"]
+        await until(lambda: counters["backed_off"] >= 4 and counters["replies"] > 0)
+        # What was sent last is not given up yet.
+        await until(lambda: counters["lost"] > 0.15 * counters["sent"])
 
 
 async def test_a_device_that_is_silent_is_told_once(peer: Peer, caplog: pytest.LogCaptureFixture) -> None:
     traffic = EchoTraffic(f"{_NET}.77", 200)
     async with sending(traffic):
-        await until(lambda: traffic.health.state == "degraded", timeout_s=10)
-        await until(lambda: traffic.health.counters["backed_off"] >= 3, timeout_s=10)
+        await until(lambda: traffic.health.state == "degraded")
+        await until(lambda: traffic.health.counters["backed_off"] >= 3)
     assert "does not answer" in traffic.health.detail
     assert [r.levelname for r in caplog.records].count("WARNING") == 1
 

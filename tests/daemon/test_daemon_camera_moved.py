@@ -6,7 +6,7 @@ import asyncio
 import signal
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -27,9 +27,25 @@ from vad.sim.scenario import Scenario, make_home
 from vad.store.records import CameraRecord
 from vad.store.store import Store
 
-HOME = make_home(1, walks=1)
 NOTICED_S, CALIBRATED_S = 60.0, 120.0
+PICTURES_PER_S = 10
+"""That are looked at where a machine keeps up: on a busy one a minute is as many pictures."""
+PATIENCE_S = 400.0
 EPOCH = 1
+
+
+class Restless(Scenario):
+    """A home whose robot drives there and back for ever: a busy machine sees little of it each time."""
+
+    def robot_at(self, t_s: float) -> tuple[float, float, float]:
+        """Where it is on its way, like a scenario's."""
+        whole_s = self.drive_end_s - self.drive_start_s
+        way_s = max(0.0, t_s - self.drive_start_s) % (2 * whole_s)
+        return super().robot_at(self.drive_start_s + min(way_s, 2 * whole_s - way_s))
+
+
+_home = make_home(1, walks=1)
+HOME = Restless(**{field.name: getattr(_home, field.name) for field in fields(_home)})
 
 
 def moved(scenario: Scenario) -> Scenario:
@@ -50,20 +66,27 @@ def kept(state_dir: Path) -> CameraCalibration:
 async def camera(
     daemon: Vad, client: VadClient, fits: Callable[[CameraMessage], bool], within_s: float
 ) -> CameraMessage:
-    """What the daemon says of its camera, once it fits."""
-    until = time.monotonic() + within_s
+    """What the daemon says of its camera, once it fits: after so long a time of pictures at most."""
+    until = time.monotonic() + PATIENCE_S
     said: list[CameraMessage] = []
-    while time.monotonic() < until:
+    while time.monotonic() < until and await pictures(client) <= within_s * PICTURES_PER_S:
         assert daemon.running, daemon.said
         said = await asyncio.to_thread(client.cameras)
         if said and fits(said[0]):
             return said[0]
         await asyncio.sleep(0.2)
-    raise AssertionError(f"not within {within_s:.0f} s; last: {said}")
+    raise AssertionError(f"not within {within_s:.0f} s of pictures; last: {said}")
+
+
+async def pictures(client: VadClient) -> int:
+    """How many the daemon has looked at."""
+    status = await asyncio.to_thread(client.status)
+    parts = () if status is None else status.parts
+    return sum(part.counters.get("frames", 0) for part in parts if part.part == "vision")
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(240)
+@pytest.mark.timeout(1200)
 async def test_it_is_noticed_within_a_minute_and_calibrated_anew_and_kept(tmp_path: Path) -> None:
     state, bus_port = tmp_path / "state", free_port()
     known = replace(true_calibration(HOME), view=CameraView.of(Renderer(HOME).frame(0.0)))
@@ -75,18 +98,16 @@ async def test_it_is_noticed_within_a_minute_and_calibrated_anew_and_kept(tmp_pa
     playing = asyncio.create_task(world.run(ready))
     try:
         await ready.wait()
-        begun = time.monotonic()
         with Vad("run", "--config", tmp_path / "vad.yaml", log=tmp_path / "daemon.log") as daemon:
             client = await asyncio.to_thread(connect, daemon, bus_port)
             try:
                 said = await camera(daemon, client, lambda c: c.state == "recalibrating", NOTICED_S)
                 assert "moved" in said.reason
                 assert said.position_m is None, "the old place is not told any more"
-                said = await camera(daemon, client, lambda c: c.state == "valid", CALIBRATED_S)
+                said = await camera(daemon, client, lambda c: c.state == "valid", NOTICED_S + CALIBRATED_S)
             finally:
                 await asyncio.to_thread(client.close)
             await asyncio.to_thread(daemon.end, signal.SIGTERM)
-        assert time.monotonic() - begun < NOTICED_S + CALIBRATED_S
     finally:
         playing.cancel()
         await asyncio.gather(playing, return_exceptions=True)

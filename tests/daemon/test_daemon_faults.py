@@ -15,6 +15,7 @@ from typing import TypeVar
 
 import cv2
 import numpy as np
+import pytest
 import yaml
 from daemon_world import Vad, connect, store_calibration
 from waiting import free_port
@@ -34,7 +35,12 @@ from vad.sim.scenario import make_home
 HOME = make_home(1)
 LAMP = HOME.device_mac
 TV = "f4:f5:d8:aa:bb:cc"
-RECOVERS_S = 15.0
+RECOVERS_S = 60.0
+"""It takes some seconds; on a busy machine many times as many."""
+OUTAGE_S = 4.0
+"""In so long everything is tried again some times."""
+
+pytestmark = pytest.mark.timeout(600)
 
 T = TypeVar("T")
 
@@ -126,9 +132,13 @@ class Hub:
         parts = (await self.status()).parts
         return next((part for part in parts if part.part.startswith(name)), Part(part=name, state="starting"))
 
-    async def becomes(self, name: str, state: str) -> Part:
-        """The part once it is in this state."""
-        return await eventually(lambda: self.part(name), lambda part: part.state == state, f"{name} {state}")
+    async def becomes(self, name: str, state: str, *words: str) -> None:
+        """Wait until the part is in this state and says one of these words, if any are given."""
+
+        def is_so(part: Part) -> bool:
+            return part.state == state and (not words or any(word in part.detail for word in words))
+
+        await eventually(lambda: self.part(name), is_so, f"{name} {state} {' or '.join(words)}")
 
     async def counts_on(self, name: str, counter: str) -> None:
         """Wait until a counter of a part goes up: it works again, whatever it says."""
@@ -141,6 +151,12 @@ class Hub:
 
     async def devices(self) -> list[DeviceMessage]:
         return await asyncio.to_thread(self._client.devices)
+
+    async def knows(self, *macs: str) -> None:
+        """Wait until these are its devices and no others."""
+        await eventually(
+            self.devices, lambda found: {device.mac for device in found} == {*macs}, f"devices {macs}"
+        )
 
 
 @asynccontextmanager
@@ -168,6 +184,7 @@ async def hub(folder: Path) -> AsyncIterator[Hub]:
                 world.plug(name)
             for name in ("robot", "camera", "csi.follow", "hostapd", "vision"):
                 await world.becomes(name, "ok")
+            await world.knows(LAMP)
             yield world
             await asyncio.to_thread(daemon.end, signal.SIGTERM)
         finally:
@@ -178,9 +195,9 @@ async def hub(folder: Path) -> AsyncIterator[Hub]:
 async def test_the_robots_port_vanishes_and_comes_back(tmp_path: Path) -> None:
     async with hub(tmp_path) as world:
         await world.unplug("robot")
-        part = await world.becomes("robot", "degraded")
-        assert "gone" in part.detail or "no such port" in part.detail
-        assert (await world.part("camera")).state == "ok", "the others go on"
+        await world.becomes("robot", "degraded", "gone", "no such port")
+        await world.becomes("camera", "ok")
+        await world.counts_on("camera", "frames")  # the others go on
         world.plug("robot")
         await world.becomes("robot", "ok")
         await world.counts_on("robot", "poses")
@@ -189,9 +206,9 @@ async def test_the_robots_port_vanishes_and_comes_back(tmp_path: Path) -> None:
 async def test_the_cameras_server_restarts(tmp_path: Path) -> None:
     async with hub(tmp_path) as world:
         await world.unplug("camera")
-        part = await world.becomes("camera", "degraded")
-        assert "127.0.0.1" in part.detail, "it says which camera"
-        assert (await world.part("robot")).state == "ok"
+        await world.becomes("camera", "degraded", "127.0.0.1")  # it says which camera
+        await world.becomes("robot", "ok")
+        await world.counts_on("robot", "poses")
         world.plug("camera")
         await world.becomes("camera", "ok")
         await world.counts_on("vision", "frames")
@@ -199,15 +216,13 @@ async def test_the_cameras_server_restarts(tmp_path: Path) -> None:
 
 async def test_hostapd_restarts_with_a_new_station(tmp_path: Path) -> None:
     async with hub(tmp_path) as world:
-        assert [device.mac for device in await world.devices()] == [LAMP]
         await world.unplug("hostapd")
-        part = await world.becomes("hostapd", "degraded")
-        assert "hostapd" in part.detail
+        await world.becomes("hostapd", "degraded", "hostapd")
         assert [device.mac for device in await world.devices()] == [LAMP], "what was known stays"
         world.stations = (LAMP, TV)
         world.plug("hostapd")
         await world.becomes("hostapd", "ok")
-        assert {device.mac for device in await world.devices()} == {LAMP, TV}
+        await world.knows(LAMP, TV)
 
 
 async def test_the_csi_logs_writer_goes_away(tmp_path: Path) -> None:
@@ -216,9 +231,8 @@ async def test_the_csi_logs_writer_goes_away(tmp_path: Path) -> None:
         await world.says(walker)
         await world.unplug("radio")
         await world.says("waiting for CSI packets of a device")
-        (lamp,) = await world.devices()
-        assert "heard" in lamp.reason
-        assert (await world.part("camera")).state == "ok"
+        await eventually(world.devices, lambda found: "heard" in found[0].reason, "it says why")
+        await world.becomes("camera", "ok")
         world.plug("radio")
         await world.says(walker)
         await world.counts_on("csi.follow", "packets")
@@ -226,10 +240,16 @@ async def test_the_csi_logs_writer_goes_away(tmp_path: Path) -> None:
 
 async def test_everything_at_once(tmp_path: Path) -> None:
     async with hub(tmp_path) as world:
+        before = len(world.daemon.said)
         await world.unplug_all()
         for name in ("robot", "camera", "hostapd"):
             await world.becomes(name, "degraded")
-        assert world.daemon.running
+        lasts_s = (await world.status()).uptime_s + OUTAGE_S
+        await eventually(world.status, lambda status: status.uptime_s > lasts_s, "it goes on without them")
+        told = [line.partition(" WARNING ")[2] for line in world.daemon.said[before:].splitlines()]
+        told = [words for words in told if words]
+        assert len(told) >= 3
+        assert len(set(told)) == len(told), "trouble is told when it is new, not over and over"
         for name in ("hostapd", "radio", "camera", "robot"):
             world.plug(name)
         for name in ("robot", "camera", "csi.follow", "hostapd"):
@@ -237,5 +257,3 @@ async def test_everything_at_once(tmp_path: Path) -> None:
         await world.counts_on("robot", "poses")
         await world.counts_on("vision", "frames")
         await world.counts_on("csi.follow", "packets")
-    said = world.daemon.said
-    assert said.count(" WARNING ") < 25, "trouble is told when it is new, not over and over"

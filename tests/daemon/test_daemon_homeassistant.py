@@ -9,10 +9,11 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from daemon_world import Vad, change_settings, connect, store_calibration, wait_for
+from daemon_world import WAIT_S, Vad, change_settings, connect, store_calibration, wait_for
 from waiting import free_port
 
 from vad.bus import messages as m
+from vad.client import QueryError
 from vad.homeassistant.topics import Topics
 from vad.sim.scenario import make_home
 
@@ -24,7 +25,7 @@ HOME = make_home(1)
 
 @needs_mosquitto
 @pytest.mark.slow
-@pytest.mark.timeout(240)
+@pytest.mark.timeout(900)
 async def test_a_home_in_home_assistant(tmp_path: Path) -> None:
     """A device joins and is there; the daemon is killed and is offline; an ignored device vanishes."""
     port = free_port()
@@ -42,16 +43,15 @@ async def test_a_home_in_home_assistant(tmp_path: Path) -> None:
                 await watcher.until(
                     lambda: {topics.device_config(mac), topics.device(mac)} <= watcher.payloads.keys(),
                     "it is announced and told",
-                    60,
                 )
                 await watcher.until_says(topics.availability, b"online")
                 assert watcher.json(topics.device(mac))["in_zones"] == ["zone.home"]
                 assert watcher.json(topics.device(mac))["source"] == "simulated"
-                await watcher.until(lambda: topics.map in watcher.payloads, "the map", 90)
+                await watcher.until(lambda: topics.map in watcher.payloads, "the map", 320)
                 vad.send(signal.SIGKILL)
                 await watcher.until_says(topics.availability, b"offline")
             with Vad("run", "--config", settings, log=tmp_path / "daemon.log") as vad:
-                await watcher.until_says(topics.availability, b"online", 60)
+                await watcher.until_says(topics.availability, b"online", WAIT_S)
                 await asyncio.to_thread(_ignore, vad, port, mac)
                 await watcher.until_says(topics.device(mac), b"")
                 await asyncio.to_thread(vad.end, signal.SIGTERM)
@@ -67,7 +67,7 @@ async def _hub(vad: Vad, port: int) -> tuple[Topics, str]:
 
     def ask() -> tuple[Topics, str]:
         with closing(connect(vad, port)) as client:
-            found: list[m.DeviceMessage] = wait_for(client.devices, "a device", 60)
+            found: list[m.DeviceMessage] = wait_for(client.devices, "a device")
             return Topics("vad", "homeassistant", found[0].hub), found[0].mac
 
     return await asyncio.to_thread(ask)
@@ -75,10 +75,15 @@ async def _hub(vad: Vad, port: int) -> tuple[Topics, str]:
 
 def _ignore(vad: Vad, port: int, mac: str) -> None:
     with closing(connect(vad, port)) as client:
-        client.wish(m.DeviceWish(mac=mac, ignore=True))
+        try:
+            client.wish(m.DeviceWish(mac=mac, ignore=True))
+        except QueryError as error:
+            if error.code != "waiting":  # for a busy disk: it is granted all the same
+                raise
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(300)
 def test_a_broker_that_is_not_there_is_trouble_and_no_more(tmp_path: Path) -> None:
     port = free_port()
     folder = tmp_path / "home"

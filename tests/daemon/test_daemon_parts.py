@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import json
-import time
-from collections.abc import AsyncIterator
+from collections import deque
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from daemon_world import settings_for
+from home_time import LATENCY_NS, STEP_NS, HomeTime
 from numpy.typing import NDArray
 from waiting import free_port, until
 
@@ -44,6 +45,12 @@ HOME = make_home(1)
 LAMP = HOME.device_mac
 WALK = HOME.walks[0]
 S = 1_000_000_000
+
+pytestmark = pytest.mark.timeout(400)
+PLAYED_S = 300.0
+"""How long a machine may take for some seconds of a simulated home."""
+TURN_LATE = 3
+"""So many pictures later at most the capture loop has had a turn."""
 
 
 def heard(radio: Radio, from_s: float, to_s: float, start_ns: int) -> CsiBatch:
@@ -161,6 +168,10 @@ def network() -> PoseNetwork:
     return PoseNetwork()
 
 
+Hearing = Callable[[float, float, int], CsiBatch]
+"""What the card gives in a stretch of the home's time, whose zero is the last argument."""
+
+
 @dataclass
 class Hub:
     """The daemon's inner parts, and the queues that its adapters would fill."""
@@ -171,6 +182,45 @@ class Hub:
     frames: FrameQueue
     batches: DropOldestQueue[CsiBatch]
     running: asyncio.Task[None]
+    time: HomeTime
+
+    @asynccontextmanager
+    async def shown(
+        self, picture: Callable[[float], NDArray[np.uint8]], hearing: Hearing, from_s: float, to_s: float
+    ) -> AsyncIterator[None]:
+        """The home from this second of its time on, for the eyes and the ears; at to_s from there again.
+
+        picture: what is seen at a time. It goes on when the picture has been seen, while the capture loop
+        keeps up with who moves, and nothing is being solved.
+        """
+        seen = 0
+        turns = deque([-1] * TURN_LATE, TURN_LATE)
+        t_s = from_s - STEP_NS / S
+
+        async def show(t_ns: int) -> None:
+            nonlocal seen, t_s
+            before_s, t_s = t_s, t_s + STEP_NS / S
+            if t_s > to_s:
+                before_s, t_s = from_s - STEP_NS / S, from_s
+            image = await asyncio.to_thread(picture, t_s - LATENCY_NS / S)
+            batch = await asyncio.to_thread(hearing, before_s, t_s, t_ns - round(t_s * S))
+            seen = self.eyes.frames
+            turns.append(self.captures.turns)
+            self.batches.put(batch)
+            self.frames.put(Frame(t_ns - LATENCY_NS, seen, image))
+
+        def kept_up() -> bool:
+            solving = self.captures.parts[2].detail.startswith("solving")
+            turned = self.captures.turns > turns[0] or not self.eyes.movers() or self.running.done()
+            return self.eyes.frames > seen and turned and not solving
+
+        playing = asyncio.create_task(self.time.play(show, kept_up))
+        try:
+            yield
+        finally:
+            playing.cancel()
+            with suppress(asyncio.CancelledError):
+                await playing
 
     async def stop(self) -> None:
         """Cancel the capture loop, as the daemon does when it ends."""
@@ -187,25 +237,26 @@ async def hub(
     settings = settings_for(folder, **sections)
     plan = floor_plan(HOME)
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    async with StoreWorker(folder / "vad.sqlite") as store, Bus(BusSettings(listen=(endpoint,))) as bus:
-        eyes = Eyes(network, max_fps=10.0, focal_px=None, known=known, on_calibration=lambda _: None)
-        ears = Ears()
-        registry = Registry(settings, plan, bus, store)
-        await registry.load()
-        captures = Captures(settings, folder, plan, eyes, ears, registry, bus)
-        frames = FrameQueue(2)
-        batches: DropOldestQueue[CsiBatch] = DropOldestQueue(256)
-        seeing = asyncio.create_task(eyes.run(frames))
-        running = asyncio.create_task(captures.run())
-        world = Hub(captures, registry, eyes, frames, batches, running)
-        try:
-            async with listening(ears) as world.batches:
-                yield world
-        finally:
-            await world.stop()
-            seeing.cancel()
-            with suppress(asyncio.CancelledError):
-                await seeing
+    with HomeTime() as clock:
+        async with StoreWorker(folder / "vad.sqlite") as store, Bus(BusSettings(listen=(endpoint,))) as bus:
+            eyes = Eyes(network, max_fps=10.0, focal_px=None, known=known, on_calibration=lambda _: None)
+            ears = Ears()
+            registry = Registry(settings, plan, bus, store)
+            await registry.load()
+            captures = Captures(settings, folder, plan, eyes, ears, registry, bus)
+            frames = FrameQueue(2)
+            batches: DropOldestQueue[CsiBatch] = DropOldestQueue(256)
+            seeing = asyncio.create_task(eyes.run(frames))
+            running = asyncio.create_task(captures.run())
+            world = Hub(captures, registry, eyes, frames, batches, running, clock)
+            try:
+                async with listening(ears) as world.batches:
+                    yield world
+            finally:
+                await world.stop()
+                seeing.cancel()
+                with suppress(asyncio.CancelledError):
+                    await seeing
 
 
 async def test_without_a_calibration_everything_waits_for_it(tmp_path: Path, network: PoseNetwork) -> None:
@@ -213,7 +264,8 @@ async def test_without_a_calibration_everything_waits_for_it(tmp_path: Path, net
         await world.registry.joined(LAMP, "lamp")
         await until(lambda: world.registry.get(LAMP).state == "waiting", "the lamp waits")
         assert world.registry.get(LAMP).reason == "the camera does not know yet where it is"
-        assert world.captures.step.startswith("calibrating the camera: 0 %, ")
+        calibrating = "calibrating the camera: 0 %, "
+        await until(lambda: world.captures.step.startswith(calibrating), "it says so")
 
 
 async def test_what_is_missing_is_told_one_after_the_other(tmp_path: Path, network: PoseNetwork) -> None:
@@ -225,9 +277,11 @@ async def test_what_is_missing_is_told_one_after_the_other(tmp_path: Path, netwo
         await world.registry.joined(LAMP, "lamp")
         await until(lambda: world.registry.get(LAMP).state == "waiting", "the lamp waits")
         assert world.registry.get(LAMP).reason == "it is not heard at all"
-        assert world.captures.step == "waiting for CSI packets of a device"
+        unheard = "waiting for CSI packets of a device"
+        await until(lambda: world.captures.step == unheard, "it says so")
 
-        start_ns = time.monotonic_ns() - int(WALK.start_s * S)
+        world.time.stand()  # rates are of the last two seconds
+        start_ns = world.time.now_ns() - int(WALK.start_s * S)
         world.batches.put(heard(radio, WALK.start_s - 0.1, WALK.start_s, start_ns))
         await until(
             lambda: "too few CSI packets" in world.registry.get(LAMP).reason, "20 packets/s are too few"
@@ -236,7 +290,8 @@ async def test_what_is_missing_is_told_one_after_the_other(tmp_path: Path, netwo
         world.batches.put(heard(radio, WALK.start_s - 1.0, WALK.start_s, start_ns))
         walker = "waiting for somebody to walk through the picture"
         await until(lambda: world.registry.get(LAMP).reason == walker, "nobody walks")
-        assert world.captures.step == walker
+        await until(lambda: world.captures.step == walker, "it says so")
+        world.time.run_until(world.time.now_ns() + 5 * S)
         await until(lambda: world.registry.get(LAMP).reason != walker, "it is silent again")
     assert not (tmp_path / "sessions").exists()
 
@@ -248,43 +303,28 @@ async def test_an_empty_room_is_looked_at_half_as_often(tmp_path: Path, network:
         await until(lambda: world.frames.step_ns > 0, "it says how often")
         moving_ns = world.frames.step_ns
 
-        async def shown(image: NDArray[np.uint8], numbers: range) -> int:
+        async def shown(image: NDArray[np.uint8], numbers: range) -> None:
             for number in numbers:
                 world.frames.put(Frame(number * S // 15, number, image))
                 await until(lambda: world.eyes.frames == number + 1, "the picture is looked at")  # noqa: B023
-            return world.frames.step_ns
 
-        still_ns = await shown(still, range(40))
-        assert still_ns > 1.2 * moving_ns
-        assert await shown(renderer.frame(WALK.start_s + 3.0), range(40, 43)) == moving_ns
-
-
-async def play(world: Hub, renderer: Renderer, from_s: float) -> None:
-    """The home from this second of its time on, for the eyes and the ears, until cancelled."""
-    radio = Radio(HOME, seed=1)
-    start_ns = time.monotonic_ns() - int(from_s * S)
-    number, t_s = 0, from_s
-    while True:
-        image = await asyncio.to_thread(renderer.frame, t_s)
-        until_s = (time.monotonic_ns() - start_ns) / S
-        world.batches.put(await asyncio.to_thread(heard, radio, t_s, until_s, start_ns))
-        world.frames.put(Frame(start_ns + int(t_s * S), number, image))
-        t_s = until_s
-        number += 1
-        await asyncio.sleep(max(0.0, 0.1 - (time.monotonic_ns() - start_ns) / S + t_s))
+        # How often is said after the look.
+        await shown(still, range(40))
+        await until(lambda: world.frames.step_ns > 1.2 * moving_ns, "half as often")
+        await shown(renderer.frame(WALK.start_s + 3.0), range(40, 43))
+        await until(lambda: world.frames.step_ns == moving_ns, "as often as before")
 
 
 @asynccontextmanager
 async def playing(world: Hub) -> AsyncIterator[None]:
     """The first walk, from the moment when the walker is in the middle of the picture."""
-    renderer = await asyncio.to_thread(Renderer, HOME)
-    task = asyncio.create_task(play(world, renderer, WALK.start_s + 3.0))
-    try:
+    renderer, radio = await asyncio.to_thread(Renderer, HOME), Radio(HOME, seed=1)
+
+    def hearing(from_s: float, to_s: float, start_ns: int) -> CsiBatch:
+        return heard(radio, from_s, to_s, start_ns)
+
+    async with world.shown(renderer.frame, hearing, WALK.start_s + 3.0, WALK.end_s):
         yield
-    finally:
-        task.cancel()
-        with suppress(asyncio.CancelledError):
-            await task
 
 
 def session_state(folder: Path) -> tuple[str, str]:
@@ -298,9 +338,9 @@ async def test_a_walk_becomes_a_session_and_a_place(tmp_path: Path, network: Pos
     async with hub(tmp_path, network, true_calibration(HOME), capture=limits) as world:
         await world.registry.joined(LAMP, "lamp")
         async with playing(world):
-            await until(lambda: world.registry.get(LAMP).state == "capturing", "a walker is seen", 15)
+            await until(lambda: world.registry.get(LAMP).state == "capturing", "a walker is seen", PLAYED_S)
             await until(lambda: world.captures.step.startswith("recording a walk for"), "it says so")
-            await until(lambda: world.registry.get(LAMP).walks == 1, "the walk is solved", 25)
+            await until(lambda: world.registry.get(LAMP).walks == 1, "the walk is solved", PLAYED_S)
         known = world.registry.get(LAMP)
         assert known.estimate is not None
         assert known.evidence["packets"] > 1500
@@ -318,7 +358,7 @@ async def test_a_stop_in_the_middle_leaves_an_aborted_session(tmp_path: Path, ne
     async with hub(tmp_path, network, true_calibration(HOME)) as world:
         await world.registry.joined(LAMP, "lamp")
         async with playing(world):
-            await until(lambda: world.captures.step.startswith("recording"), "a capture", 15)
+            await until(lambda: world.captures.step.startswith("recording"), "a capture", PLAYED_S)
             await world.stop()
     assert session_state(tmp_path) == ("aborted", "the daemon stopped")
 
@@ -330,6 +370,8 @@ async def test_sessions_that_cannot_be_written_are_a_reason_and_no_end(
     async with hub(tmp_path, network, true_calibration(HOME)) as world:
         await world.registry.joined(LAMP, "lamp")
         async with playing(world):
-            await until(lambda: "cannot be written" in world.registry.get(LAMP).reason, "it says why", 15)
+            await until(
+                lambda: "cannot be written" in world.registry.get(LAMP).reason, "it says why", PLAYED_S
+            )
         assert world.registry.get(LAMP).state == "waiting"
         assert not world.running.done()

@@ -53,7 +53,7 @@ class Robot:
         self._ready = threading.Event()
         self._thread = threading.Thread(target=lambda: self._loop.run_until_complete(self._serve()))
         self._thread.start()
-        assert self._ready.wait(10)
+        assert self._ready.wait(40)
 
     async def _serve(self) -> None:
         async with ValetudoServer(keep_alive_s=0.5) as self._server:
@@ -62,11 +62,11 @@ class Robot:
             await self._stop.wait()
 
     def publish(self, data: bytes) -> None:
-        asyncio.run_coroutine_threadsafe(self._server.publish(data), self._loop).result(10)
+        asyncio.run_coroutine_threadsafe(self._server.publish(data), self._loop).result(40)
 
     def close(self) -> None:
         self._loop.call_soon_threadsafe(self._stop.set)
-        self._thread.join(10)
+        self._thread.join(40)
         self._loop.close()
 
 
@@ -79,6 +79,7 @@ def robot() -> Iterator[Robot]:
         made.close()
 
 
+@pytest.mark.timeout(400)
 def test_a_map_made_anew_moves_devices_and_camera(tmp_path: Path) -> None:
     plan = home(origin=(5.0, 5.0, 0.0))
     new, way = turned(plan)

@@ -20,6 +20,8 @@ from vad.sim.scenario import make_home
 
 HOME = make_home(1, walks=1)
 
+pytestmark = pytest.mark.timeout(300)
+
 
 @asynccontextmanager
 async def solving(**arguments: float) -> AsyncIterator[Solver]:

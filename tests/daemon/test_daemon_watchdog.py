@@ -28,11 +28,16 @@ class Fed:
         self.times += 1
 
     async def look(self) -> bool:
-        """Whether the next look feeds; every free thread has had its turn."""
+        """Whether the next look feeds; the thread that it asked for has had its turn."""
         before = self.times
         self.watchdog.look(FEED_S)
-        await asyncio.get_running_loop().run_in_executor(None, int)
+        await self.thread()
         return self.times > before
+
+    async def thread(self) -> None:
+        """Wait for the thread that the last look asked for: others are no sign of it."""
+        assert self.watchdog._thread is not None
+        await self.watchdog._thread
 
 
 async def test_an_idle_home_is_fed() -> None:
@@ -95,6 +100,7 @@ async def test_threads_that_are_all_taken_are_noticed() -> None:
     finally:
         release.set()
     await asyncio.gather(*taken)
+    await fed.thread()
     fed.watchdog.look(FEED_S)
     assert fed.watchdog.stuck == ()
 

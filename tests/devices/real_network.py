@@ -7,13 +7,14 @@ root and the Debian packages in PACKAGES.
 from __future__ import annotations
 
 import os
+import secrets
 import shutil
 import signal
 import subprocess
-import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Self
+
+from waiting import wait_until
 
 PACKAGES = "hostapd wpasupplicant dnsmasq-base iproute2 busybox-static"
 _TOOLS = ("hostapd", "wpa_supplicant", "wpa_cli", "dnsmasq", "ip", "busybox")
@@ -50,7 +51,7 @@ def why_not() -> str:
         return f"no {', '.join(missing)}: apt-get install {PACKAGES}"
     if _run("busybox", "udhcpc", "--help").returncode == 127:
         return "this busybox has no udhcpc: apt-get install busybox-static"
-    probe = f"vad-probe-{os.getpid()}"
+    probe = f"vad-probe-{secrets.token_hex(4)}"
     if _run("ip", "netns", "add", probe).returncode != 0:
         return "network namespaces cannot be made here"
     _run("ip", "netns", "del", probe)
@@ -68,21 +69,14 @@ def _do(*command: str) -> str:
     return done.stdout
 
 
-def until(condition: Callable[[], bool], what: str, timeout_s: float = 15.0) -> None:
-    """Wait for a condition."""
-    deadline_s = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline_s, f"not in {timeout_s:g} s: {what}"
-        time.sleep(0.005)
-
-
 class RealNetwork:
     """`wires` cables with a station each; everything of it is gone when it is left."""
 
     def __init__(self, folder: Path, wires: int = 2) -> None:
         self.folder = folder
         self.leases = folder / "leases"
-        self._hub, self._home = f"vadhub{os.getpid()}", f"vadsta{os.getpid()}"
+        name = secrets.token_hex(4)  # of its own: what a killed run left does not stand in the way
+        self._hub, self._home = f"vadhub{name}", f"vadsta{name}"
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._wires = range(wires)
 
@@ -121,7 +115,7 @@ class RealNetwork:
         config.write_text(_HOSTAPD.format(wire=f"v{wire}", folder=self.folder))
         self.socket(wire).unlink(missing_ok=True)
         self._start(f"hostapd{wire}", self._hub, "hostapd", "-t", str(config))
-        until(self.socket(wire).exists, "hostapd's control socket")
+        wait_until(self.socket(wire).exists, "hostapd's control socket")
 
     def start_dnsmasq(self) -> None:
         """Start dnsmasq for all cables."""
@@ -131,17 +125,23 @@ class RealNetwork:
         options = ("--user=root", "--conf-file=/dev/null", "--port=0", "--no-ping", "--dhcp-authoritative")
         files = (f"--dhcp-leasefile={self.leases}", f"--pid-file={self.folder}/dnsmasq.pid")
         self._start("dnsmasq", self._hub, "dnsmasq", "-k", *options, *files, *ranges)
-        until(self.leases.exists, "dnsmasq's lease file")
+        wait_until(self.leases.exists, "dnsmasq's lease file")
 
     def join(self, wire: int, mac: str) -> None:
         """A station with this address plugs in; it has joined some time after this returns."""
         self.leave(wire)
         _do("ip", "-n", self._home, "link", "set", f"s{wire}", "down")
         _do("ip", "-n", self._home, "link", "set", f"s{wire}", "address", mac, "up")
+        # A hello that is lost while the cable comes up is said again after half a minute.
+        wait_until(lambda: self._carries(wire), "the cable carries")
         config = self.folder / f"supplicant{wire}.conf"
         config.write_text(_SUPPLICANT.format(folder=self.folder))
         command = ("wpa_supplicant", "-t", "-i", f"s{wire}", "-D", "wired", "-c", str(config))
         self._start(f"station{wire}", self._home, *command)
+
+    def _carries(self, wire: int) -> bool:
+        ends = ((self._hub, f"v{wire}"), (self._home, f"s{wire}"))
+        return all("state UP" in _do("ip", "-n", space, "link", "show", "dev", end) for space, end in ends)
 
     def leave(self, wire: int) -> None:
         """The station says goodbye and goes."""
@@ -160,12 +160,12 @@ class RealNetwork:
     def ask_for_address(self, wire: int, host_name: str) -> None:
         """The station asks for an address, and has it when this returns."""
         script = str(self.folder / "on_lease")
-        udhcpc = ("busybox", "udhcpc", "-i", f"s{wire}", "-n", "-q", "-t", "20", "-T", "1", "-s", script)
+        udhcpc = ("busybox", "udhcpc", "-i", f"s{wire}", "-n", "-q", "-t", "60", "-T", "1", "-s", script)
         _do("ip", "netns", "exec", self._home, *udhcpc, "-x", f"hostname:{host_name}")
 
     def answers(self, wire: int, ip: str) -> bool:
         """Whether the hub reaches this address by an ICMP echo."""
-        command = ("ping", "-c", "1", "-W", "1", "-I", f"v{wire}", ip)
+        command = ("ping", "-c", "1", "-W", "20", "-I", f"v{wire}", ip)
         return _run("ip", "netns", "exec", self._hub, "busybox", *command).returncode == 0
 
     def stop(self, name: str, number: signal.Signals = signal.SIGTERM) -> None:
@@ -173,7 +173,7 @@ class RealNetwork:
         process = self._processes.pop(name)
         process.send_signal(number)
         try:
-            process.wait(5.0)
+            process.wait(40.0)
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import socket
 from collections.abc import AsyncIterator, Iterator
 
 import pytest
 import zenoh
-from waiting import until
+from waiting import free_port, until
 
 from vad.agent.info import AgentInfo, decode_info, encode_info
 from vad.bus.keys import HubKeys
@@ -31,9 +30,7 @@ def said(payload: bytes) -> AgentSaid:
 
 @pytest.fixture
 def endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return f"tcp/127.0.0.1:{free_port()}"
 
 
 @pytest.fixture
@@ -88,7 +85,7 @@ async def running(router: zenoh.Session, out: Events) -> AsyncIterator[AgentSour
 
 
 async def take(out: Events) -> tuple[str, str, str | None, str | None, str]:
-    async with asyncio.timeout(8.0):
+    async with asyncio.timeout(40.0):
         event = await out.get()
     return event.kind, event.mac, event.agent, event.host_name, event.interface
 

@@ -114,7 +114,7 @@ def test_the_kernels_own_events(tmp_path: Path) -> None:
 
 
 async def take(out: Events) -> tuple[str, str, str | None, str | None]:
-    async with asyncio.timeout(5.0):
+    async with asyncio.timeout(40.0):
         event = await out.get()
     return event.kind, event.mac, event.host_name, event.ip
 

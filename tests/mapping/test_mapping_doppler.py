@@ -16,6 +16,9 @@ from vad.sensing.resample import antenna_ratio, to_uniform
 from vad.sensing.spectrogram import spectrogram
 from vad.sensing.template import moving_part
 
+pytestmark = pytest.mark.timeout(600)
+"""Much work for the processor: a busy machine takes many times as long as an idle one."""
+
 CARRIER_HZ = 5.24e9
 WAVELENGTH_M = SPEED_OF_LIGHT_MPS / CARRIER_HZ
 ANCHOR = np.array([0.0, 0.0])

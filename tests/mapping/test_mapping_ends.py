@@ -5,12 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from home_walks import recordings
 
 from vad.mapping.device_stage import evidence_from_walk, place_from_posterior
 from vad.mapping.evidence import Terms
 from vad.mapping.posterior import Grid
 from vad.sim.scenario import make_home
+
+pytestmark = pytest.mark.timeout(600)
+"""Much work for the processor: a busy machine takes many times as long as an idle one."""
 
 SEED = 1
 

@@ -14,6 +14,9 @@ from vad.mapping.height import OFF_TORSO_M, height_range_m
 from vad.mapping.posterior import Grid
 from vad.sim.scenario import make_home
 
+pytestmark = pytest.mark.timeout(600)
+"""Much work for the processor: a busy machine takes many times as long as an idle one."""
+
 TORSO_M = 0.95
 SEED = 3
 

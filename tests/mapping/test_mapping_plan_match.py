@@ -18,6 +18,9 @@ from vad.mapping.plan_match import IDENTITY, Occupancy, PlanTransform, agreement
 from vad.robot.map_server import floor_plan_from_bytes
 from vad.robot.valetudo import map_from_payload
 
+pytestmark = pytest.mark.timeout(600)
+"""Much work for the processor: a busy machine takes many times as long as an idle one."""
+
 DIFFERENT_HOMES = (
     "3irobotix__converted_3790",
     "3irobotix__viomi_v6_41_no_path",

@@ -7,8 +7,10 @@ import contextlib
 import os
 import tty
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from waiting import until
 
 from vad.robot.json_line import MAX_LINE_BYTES, JsonLineDialogue, json_line
 from vad.robot.json_line_source import JsonLineSource
@@ -77,6 +79,7 @@ def test_a_line_without_end_is_dropped() -> None:
     assert len(dialogue.receive(b"\n" + json_line(POSE), 0)) == 1
 
 
+@pytest.mark.usefixtures("patient")
 async def test_over_a_pty() -> None:
     master, slave = os.openpty()
     tty.setraw(slave)
@@ -84,15 +87,13 @@ async def test_over_a_pty() -> None:
     out: DropOldestQueue[RobotPose] = DropOldestQueue(8)
     task = asyncio.create_task(source.run(out))
     try:
-        async with asyncio.timeout(5):
-            while not source.health.counters["opened"]:  # noqa: ASYNC110 - health has no event
-                await asyncio.sleep(0.01)
-            os.write(master, b"hello\n" + json_line(POSE))
+        await until(lambda: source.health.counters["opened"])
+        os.write(master, b"hello\n" + json_line(POSE))
+        async with asyncio.timeout(40):
             assert (await out.get()).x_m == 1.2
-            assert source.status == "localised"
-            os.write(master, json_line(b'{"status": "lost"}'))
-            while source.status != "lost":  # noqa: ASYNC110 - the status has no event
-                await asyncio.sleep(0.01)
+        assert source.status == "localised"
+        os.write(master, json_line(b'{"status": "lost"}'))
+        await until(lambda: source.status == "lost")
         assert "dock" in source.health.detail
         assert source.health.counters["bad_input"] == 1
     finally:

@@ -127,6 +127,7 @@ def test_nothing_and_nonsense_draw_nothing() -> None:
     assert drawn.floor_plan(1) is None
 
 
+@pytest.mark.usefixtures("patient")
 async def test_over_a_pty_the_map_is_drawn_while_poses_come() -> None:
     where: list[Pose] = [(0.0, 0.0, 0.3)]
 
@@ -141,7 +142,7 @@ async def test_over_a_pty_the_map_is_drawn_while_poses_come() -> None:
     out: DropOldestQueue[RobotPose] = DropOldestQueue(512)
     tasks = [asyncio.create_task(robot.run()), asyncio.create_task(source.run(out))]
     try:
-        async with asyncio.timeout(15):
+        async with asyncio.timeout(40):
             for place in ((0.0, 0.0, 0.3), (2.0, 1.0, 2.0)):
                 where[0] = place
                 plan = await source.plans.get()

@@ -13,12 +13,15 @@ import time
 import tty
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import ClassVar
 
 import pytest
 import serial
 import serial.rfc2217
-from waiting import running, until
+from waiting import free_port, running, until
 
+from vad.robot import serial_port
 from vad.robot.neato_source import NeatoSource
 from vad.robot.pose import RobotPose
 from vad.sim.neato import Pose, VirtualNeato
@@ -32,27 +35,32 @@ def circle(t_ns: int) -> Pose:
     return 2 * math.cos(angle), 2 * math.sin(angle), math.remainder(angle + math.pi / 2, math.tau)
 
 
-async def take(out: Poses, timeout_s: float = 5.0) -> RobotPose:
+async def take(out: Poses, timeout_s: float = 40.0) -> RobotPose:
     async with asyncio.timeout(timeout_s):
         return await out.get()
 
 
+@pytest.mark.usefixtures("patient")
 async def test_poses_are_where_the_robot_was_at_their_time() -> None:
     robot = VirtualNeato(circle, latency_s=0.2)
     source = NeatoSource(robot.path, epoch=7)
     out: Poses = DropOldestQueue(64)
     async with running(robot.run(), source.run(out)):
-        poses = [await take(out) for _ in range(7)]
+        # At 2 m/s the start or the end of the exchange would be 0.2 m off or more, for every pose; the middle
+        # is not where the way there took as long as the way back: a busy machine has such exchanges, too.
+        poses = []
+        while len(poses) < 4:
+            pose = await take(out)
+            if math.dist((pose.x_m, pose.y_m), circle(pose.t_ns)[:2]) < 0.1:
+                poses.append(pose)
         assert source.health.state == "ok"
-    errors_m = [math.dist((p.x_m, p.y_m), circle(p.t_ns)[:2]) for p in poses]
-    # At 2 m/s the start or the end of the exchange would be 0.2 m off.
-    assert sorted(errors_m)[len(errors_m) // 2] < 0.1
-    first = poses[0]
-    assert (first.epoch, first.quality, first.sigma_m) == (7, "slam", 0.02)
-    assert first.sigma_yaw_rad == pytest.approx(math.radians(1))
-    assert math.remainder(first.yaw_rad - circle(first.t_ns)[2], math.tau) == pytest.approx(0, abs=0.1)
+    for pose in poses:
+        assert (pose.epoch, pose.quality, pose.sigma_m) == (7, "slam", 0.02)
+        assert pose.sigma_yaw_rad == pytest.approx(math.radians(1))
+        assert math.remainder(pose.yaw_rad - circle(pose.t_ns)[2], math.tau) == pytest.approx(0, abs=0.1)
 
 
+@pytest.mark.usefixtures("patient")
 async def test_not_localised_is_said_and_gives_no_pose() -> None:
     where: list[Pose | None] = [None]
     robot = VirtualNeato(lambda _t_ns: where[0])
@@ -68,8 +76,25 @@ async def test_not_localised_is_said_and_gives_no_pose() -> None:
         assert source.health.state == "ok"
 
 
-async def test_unplugged_and_plugged_in_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+class _NotedWaits(threading.Event):
+    """How long it was to be waited for."""
+
+    asked_s: ClassVar[list[float]] = []
+
+    def wait(self, timeout: float | None = None) -> bool:
+        assert timeout is not None
+        self.asked_s.append(timeout)
+        return super().wait(timeout)
+
+
+@pytest.mark.usefixtures("patient")
+async def test_unplugged_and_plugged_in_again(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     caplog.set_level(logging.DEBUG, "vad.robot.serial_port")
+    monkeypatch.setattr(_NotedWaits, "asked_s", [])
+    noted = SimpleNamespace(Event=_NotedWaits, Thread=threading.Thread)
+    monkeypatch.setattr(serial_port, "threading", noted)
     link = tmp_path / "ttyNEATO"
     first = VirtualNeato(circle, link=link)
     source = NeatoSource(str(link), epoch=0)
@@ -79,16 +104,17 @@ async def test_unplugged_and_plugged_in_again(tmp_path: Path, caplog: pytest.Log
             await take(out)
         assert not link.exists()
         # Long enough for the back-off to reach its end.
-        await until(lambda: _count(caplog, "no such port") >= 4, timeout_s=8.0)
+        await until(lambda: _count(caplog, "no such port") >= 5)
         assert source.health.state == "degraded"
         assert _count(caplog, "no such port", logging.WARNING) == 1
         out.drain()
         second = VirtualNeato(circle, link=link)
-        plugged_s = time.monotonic()
         async with running(second.run()):
             await take(out)
-            assert time.monotonic() - plugged_s < 2.0
             assert source.health.state == "ok"
+    waits_s = _NotedWaits.asked_s
+    assert max(waits_s) == 1.0, "so soon after it is plugged in, at the latest, it is opened"
+    assert waits_s[0] < 0.2, "and sooner where it was away for a moment"
 
 
 def _count(caplog: pytest.LogCaptureFixture, text: str, level: int = logging.DEBUG) -> int:
@@ -138,12 +164,18 @@ async def test_silence_is_noticed(raw_pty: tuple[int, str], noise: bytes, hint: 
     master, path = raw_pty
     source = NeatoSource(path, epoch=0)
     async with running(source.run(DropOldestQueue(1))):
-        await until(lambda: source.health.counters["opened"] == 1)
-        os.write(master, noise)
-        await until(lambda: source.health.state == "degraded", timeout_s=4.0)
-        assert hint in source.health.detail
+
+        def told() -> bool:
+            # On and on: however late the line is listened to, there is something to hear.
+            with contextlib.suppress(BlockingIOError):
+                os.write(master, noise)
+            return hint in source.health.detail
+
+        await until(told)
+        assert source.health.state == "degraded"
 
 
+@pytest.mark.usefixtures("patient")
 async def test_byte_at_a_time_with_garbage_between(raw_pty: tuple[int, str]) -> None:
     master, path = raw_pty
     source = NeatoSource(path, rate_hz=20.0, epoch=0)
@@ -175,10 +207,10 @@ class _Bridge:
         self._clients: set[asyncio.StreamWriter] = set()
 
     @contextlib.asynccontextmanager
-    async def serving(self, port: int = 0) -> AsyncIterator[int]:
+    async def serving(self, port: int) -> AsyncIterator[None]:
         server = await asyncio.start_server(self._serve, "127.0.0.1", port)
         try:
-            yield server.sockets[0].getsockname()[1]
+            yield
         finally:
             server.close()
             for client in self._clients:
@@ -195,12 +227,18 @@ class _Bridge:
         self._clients.discard(writer)
 
 
+def threads(port: str) -> int:
+    """How many threads speak on this port."""
+    return sum(t.name == f"serial {port}" for t in threading.enumerate())
+
+
+@pytest.mark.usefixtures("patient")
 async def test_over_a_tcp_socket_and_again_after_the_bridge_restarts() -> None:
     robot = VirtualNeato(circle)
-    bridge = _Bridge(robot)
+    bridge, port = _Bridge(robot), free_port()
     out: Poses = DropOldestQueue(8)
     try:
-        async with bridge.serving() as port:
+        async with bridge.serving(port):
             source = NeatoSource(f"socket://127.0.0.1:{port}", epoch=0)
             task = asyncio.create_task(source.run(out))
             await take(out)
@@ -208,14 +246,15 @@ async def test_over_a_tcp_socket_and_again_after_the_bridge_restarts() -> None:
         out.drain()
         async with bridge.serving(port):
             await take(out)
-            ending_s = time.monotonic()
+            assert threads(f"socket://127.0.0.1:{port}") == 1
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
-            assert time.monotonic() - ending_s < 1.0
+            assert threads(f"socket://127.0.0.1:{port}") == 0
     finally:
         robot.close()
 
 
+@pytest.mark.usefixtures("patient")
 @pytest.mark.filterwarnings("ignore:set(Daemon|Name):DeprecationWarning")
 async def test_over_rfc2217() -> None:
     robot = VirtualNeato(circle)
@@ -229,16 +268,24 @@ async def test_over_rfc2217() -> None:
         async with running(robot.run(), source.run(out)):
             for _ in range(3):
                 await take(out)
-            ending_s = time.monotonic()
-        assert time.monotonic() - ending_s < 1.0
+            assert threads(url) == 1
+        assert threads(url) == 0
     finally:
+        listener.shutdown(socket.SHUT_RDWR)  # who waits there for a client wakes
         listener.close()
         await until(lambda: not server.is_alive())
 
 
 def _serve_rfc2217(listener: socket.socket, path: str) -> None:
-    """One client of a serial port server, until it hangs up (pyserial's own server side)."""
-    connection, _ = listener.accept()
+    """A serial port server, one client after the other: one that had to wait too long comes again."""
+    with contextlib.suppress(OSError):  # nobody listens any more
+        while True:
+            connection, _ = listener.accept()
+            _serve_client(connection, path)
+
+
+def _serve_client(connection: socket.socket, path: str) -> None:
+    """One client, until it hangs up (pyserial's own server side)."""
     with connection, _WithoutModemLines(path, timeout=0) as port:
         connection.settimeout(0.005)
         write = _Writer(connection)
@@ -272,13 +319,15 @@ class _Writer:
             self._connection.sendall(data)
 
 
-async def test_cancelling_ends_the_thread_at_once() -> None:
+@pytest.mark.usefixtures("patient")
+async def test_cancelling_ends_the_thread_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It waits for hours then, for a line that says nothing: only the end itself can wake it."""
+    monkeypatch.setattr(serial_port, "LONGEST_WAIT_S", 10_000.0)
     robot = VirtualNeato(circle)
-    source = NeatoSource(robot.path, epoch=0)
+    source = NeatoSource(robot.path, rate_hz=0.0001, epoch=0)
     out: Poses = DropOldestQueue(8)
-    async with running(robot.run(), source.run(out)):
-        await take(out)
-        assert any(t.name == f"serial {robot.path}" for t in threading.enumerate())
-        ending_s = time.monotonic()
-    assert time.monotonic() - ending_s < 0.5
-    assert not any(t.name == f"serial {robot.path}" for t in threading.enumerate())
+    async with running(robot.run()):
+        async with running(source.run(out)):
+            await take(out)
+            assert threads(robot.path) == 1
+        assert threads(robot.path) == 0

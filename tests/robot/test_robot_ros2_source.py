@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-import socket
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from typing import Any
@@ -15,6 +14,7 @@ import pytest
 import ros2_messages as ros
 import zenoh
 import zenoh.ext
+from waiting import free_port, until
 
 from vad.robot.pose import RobotPose
 from vad.robot.ros2_source import Ros2Source, Ros2Topics
@@ -26,9 +26,7 @@ CELLS = np.arange(12, dtype=np.int8).reshape(3, 4)
 
 @pytest.fixture
 def endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return f"tcp/127.0.0.1:{free_port()}"
 
 
 @contextlib.contextmanager
@@ -95,7 +93,7 @@ def drive_tf(stamp_ns: int) -> bytes:
     return ros.tf(*links, stamp_ns=stamp_ns)
 
 
-async def take(out: DropOldestQueue[RobotPose], timeout_s: float = 10.0) -> RobotPose:
+async def take(out: DropOldestQueue[RobotPose], timeout_s: float = 40.0) -> RobotPose:
     async with asyncio.timeout(timeout_s):
         return await out.get()
 
@@ -113,10 +111,9 @@ async def test_poses_and_a_map_that_was_there_before(endpoint: str, style: str) 
         async with running(source, out), driving(robot, tf_key, drive_tf):
             before_ns = time.monotonic_ns()
             pose = await take(out)
-            async with asyncio.timeout(5):
+            async with asyncio.timeout(40):
                 plan = await source.plans.get()
-            assert source.health.state == "ok"
-            assert source.status == "localised"
+            await until(lambda: source.health.state == "ok" and source.status == "localised")
         assert (pose.x_m, pose.y_m, pose.epoch) == (3.0, 0.5, 5)
         assert before_ns - 10**9 < pose.t_ns <= time.monotonic_ns()
         np.testing.assert_array_equal(plan.cells, CELLS)
@@ -129,26 +126,22 @@ async def test_the_router_is_restarted(endpoint: str) -> None:
     tf_key, map_key = rmw("tf", "tf2_msgs/msg/TFMessage"), rmw("map", "nav_msgs/msg/OccupancyGrid")
     async with running(source, out):
         # Nobody is there yet.
-        async with asyncio.timeout(5):
-            while source.health.state != "degraded":  # noqa: ASYNC110 - health has no event
-                await asyncio.sleep(0.01)
+        await until(lambda: source.health.state == "degraded")
         assert "rmw_zenohd" in source.health.detail
         with router(endpoint) as robot:
             async with driving(robot, tf_key, drive_tf):
                 await take(out)
-        async with asyncio.timeout(10):
-            while source.health.state != "degraded":  # noqa: ASYNC110 - health has no event
-                await asyncio.sleep(0.01)
+        await until(lambda: source.health.state == "degraded")
         assert source.status == "lost"
         out.drain()
         with router(endpoint) as robot:
             async with driving(robot, tf_key, drive_tf):
                 await take(out)
-                assert source.health.state == "ok"
+                await until(lambda: source.health.state == "ok")
                 # The map comes long after the robot was found.
                 keeper = latched(robot, map_key)
                 keeper.put(ros.grid(CELLS))
-                async with asyncio.timeout(10):
+                async with asyncio.timeout(40):
                     plan = await source.plans.get()
                 keeper.undeclare()
     np.testing.assert_array_equal(plan.cells, CELLS)
@@ -167,5 +160,5 @@ async def test_rubbish_is_counted_and_other_topics_are_left_alone(endpoint: str)
         async with running(source, out), driving(robot, "pose", mixed):
             await take(out)
             await take(out)
-        assert source.health.counters["bad_input"] >= 1
-        assert source.health.state == "ok"
+            assert source.health.counters["bad_input"] >= 1
+            await until(lambda: source.health.state == "ok")

@@ -11,7 +11,7 @@ from collections.abc import AsyncIterator
 import pytest
 import zenoh
 from test_robot_valetudo import SMALL
-from waiting import until
+from waiting import free_port, until
 
 from vad.errors import ConfigError
 from vad.robot.pose import MapSource, RobotPose
@@ -34,7 +34,7 @@ async def running(source: ValetudoSource, out: Poses) -> AsyncIterator[None]:
         assert task.cancelled()
 
 
-async def take(out: Poses, timeout_s: float = 5.0) -> RobotPose:
+async def take(out: Poses, timeout_s: float = 40.0) -> RobotPose:
     async with asyncio.timeout(timeout_s):
         return await out.get()
 
@@ -57,7 +57,7 @@ async def test_maps_and_poses_come_and_a_cut_connection_comes_back() -> None:
             await robot.cut_off()
             assert (await take(out)).x_m == 2.5
             await robot.publish(b'{"nonsense": 1}')
-            await until(lambda: source.health.counters["bad_input"] == 1)
+            await until(lambda: source.health.counters["bad_input"] >= 1)
             await robot.publish(json.dumps(moved | {"entities": []}).encode())
             await until(lambda: source.status == "not_localised")
             assert "let it clean once" in source.health.detail
@@ -65,7 +65,7 @@ async def test_maps_and_poses_come_and_a_cut_connection_comes_back() -> None:
 
 
 async def test_a_robot_that_is_not_there_or_wants_a_password_is_told() -> None:
-    async with ValetudoServer(password="vad:s3cret") as robot:
+    async with ValetudoServer(free_port(), password="vad:s3cret") as robot:
         source = ValetudoSource(f"http://127.0.0.1:{robot.port}", epoch=0)
         async with running(source, DropOldestQueue(1)):
             await until(lambda: "password" in source.health.detail)
@@ -75,8 +75,11 @@ async def test_a_robot_that_is_not_there_or_wants_a_password_is_told() -> None:
 
 
 async def test_another_server_is_told() -> None:
-    async def greet(_reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def greet(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         writer.write(b"SSH-2.0-dropbear\r\n\r\n")
+        # A request that nobody has read would reset the connection, and take the greeting with it.
+        with contextlib.suppress(OSError, asyncio.IncompleteReadError):
+            await reader.readuntil(b"\r\n\r\n")
         writer.close()
 
     server = await asyncio.start_server(greet, "127.0.0.1", 0)

@@ -18,6 +18,9 @@ from vad.sensing.template import moving_part
 from vad.sim.radio import Radio
 from vad.sim.scenario import CARRIER_HZ, make_home
 
+pytestmark = pytest.mark.timeout(600)
+"""Much work for the processor: a busy machine takes many times as long as an idle one."""
+
 Times = NDArray[np.int64]
 Floats = NDArray[np.float64]
 

@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 from vad.sensing.resample import CLIP_MEDIANS, MAX_GAP_S, RATE_HZ, antenna_ratio, to_uniform, without_outliers
 from vad.sensing.template import moving_part, subcarriers
 
+pytestmark = pytest.mark.timeout(600)
+"""Much work for the processor: a busy machine takes many times as long as an idle one."""
+
 Times = NDArray[np.int64]
 Csi = NDArray[np.complex64]
 

@@ -7,12 +7,16 @@ import json
 import socket
 import struct
 import threading
+import time
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from waiting import free_port
 
 from vad.errors import ConfigError
+from vad.setup import lan
 from vad.setup.draft import channel_hz, robot_url, router_endpoint
 from vad.setup.lan import find_valetudo, hear_router, hear_valetudo, is_mdns_answer, mdns_question
 from vad.sim.valetudo import ValetudoServer
@@ -34,7 +38,17 @@ def answer_to(question: bytes) -> bytes:
     )
 
 
-def test_a_robot_that_answers_by_multicast_dns_is_found() -> None:
+def test_a_robot_that_answers_by_multicast_dns_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    heard: list[bytes] = []
+
+    def listened(data: bytes) -> bool:
+        heard.append(data)
+        return is_mdns_answer(data)
+
+    # The search ends when all was heard, however long that takes.
+    clock = SimpleNamespace(monotonic=lambda: time.monotonic() + (1000.0 if len(heard) == 3 else 0.0))
+    monkeypatch.setattr(lan, "is_mdns_answer", listened)
+    monkeypatch.setattr(lan, "time", clock)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as responder:
         responder.bind(("127.0.0.1", 0))
 
@@ -46,7 +60,7 @@ def test_a_robot_that_answers_by_multicast_dns_is_found() -> None:
 
         thread = threading.Thread(target=answer)
         thread.start()
-        found = find_valetudo(0.5, to=responder.getsockname())
+        found = find_valetudo(40.0, to=responder.getsockname())
         thread.join()
     assert found == ["127.0.0.1"]
 
@@ -61,7 +75,7 @@ def test_a_question_is_no_answer() -> None:
 
 
 async def test_a_robot_with_valetudo_is_heard_or_says_why_not() -> None:
-    async with ValetudoServer(password="me:secret") as robot:
+    async with ValetudoServer(free_port(), password="me:secret") as robot:
         robot_map = {
             "__class": "ValetudoMap",
             "metaData": {"version": 2},
@@ -78,24 +92,24 @@ async def test_a_robot_with_valetudo_is_heard_or_says_why_not() -> None:
             ],
         }
         await robot.publish(json.dumps(robot_map).encode())
-        good, told = await hear_valetudo(robot.url, 5.0)
+        good, told = await hear_valetudo(robot.url, 40.0)
         assert (good, told) == (True, "0 rooms, localised")
-        good, told = await hear_valetudo(robot.url.replace("me:secret@", ""), 5.0)
+        good, told = await hear_valetudo(robot.url.replace("me:secret@", ""), 40.0)
         assert not good
         assert "password" in told
-    good, told = await hear_valetudo(robot.url, 5.0)
+    good, told = await hear_valetudo(robot.url, 40.0)
     assert not good
     assert "cannot be reached" in told
     assert not (await hear_valetudo("ftp://robot", 1.0))[0]
 
 
 async def test_a_router_answers_or_does_not() -> None:
-    server = await asyncio.start_server(lambda _reader, writer: writer.close(), "127.0.0.1", 0)
-    port = server.sockets[0].getsockname()[1]
-    assert await hear_router(f"tcp/127.0.0.1:{port}", 2.0) == (True, "it answers")
+    port = free_port()
+    server = await asyncio.start_server(lambda _reader, writer: writer.close(), "127.0.0.1", port)
+    assert await hear_router(f"tcp/127.0.0.1:{port}", 40.0) == (True, "it answers")
     server.close()
     await server.wait_closed()
-    good, told = await hear_router(f"tcp/127.0.0.1:{port}", 2.0)
+    good, told = await hear_router(f"tcp/127.0.0.1:{port}", 40.0)
     assert not good
     assert str(port) in told
 

@@ -19,7 +19,7 @@ async def test_a_neato_tells_its_model_and_is_only_asked_for_its_version() -> No
     robot = VirtualNeato(lambda _t_ns: None)
     task = asyncio.create_task(robot.run())
     try:
-        assert await asyncio.to_thread(ask_version, robot.path, 5.0) == NeatoVersion("BotVacD5", "4.5.3")
+        assert await asyncio.to_thread(ask_version, robot.path, 40.0) == NeatoVersion("BotVacD5", "4.5.3")
         assert robot.answered <= 2  # the empty line, and the question
     finally:
         task.cancel()

@@ -9,8 +9,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import pytest
 from hub_tree import add_wireless, put
 
+from vad.setup import wifi
 from vad.setup.draft import radio_choice
 from vad.setup.wifi import (
     AccessPoint,
@@ -26,6 +28,12 @@ STATUS = (
     "state=ENABLED\nphy=phy0\nfreq=5240\nnum_sta_non_erp[0]=0\nchannel=48\nsecondary_channel={second}\n"
     "ieee80211n=1\nbss[0]=wlan0\nssid[0]=home\nnum_sta[0]=7\n"
 )
+
+
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who answers here may be on a busy machine."""
+    monkeypatch.setattr(wifi, "_ANSWER_S", 40.0)
 
 
 @contextmanager

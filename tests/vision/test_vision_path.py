@@ -18,6 +18,9 @@ from vad.vision.standing import Standing, standing
 from vad.vision.tracks import Track, Tracker
 from vad.vision.watch import PeopleWatch
 
+pytestmark = pytest.mark.timeout(600)
+"""Much work for the processor: a busy machine takes many times as long as an idle one."""
+
 LENS = Intrinsics(640, 480, 410.0, 410.0, 320.0, 240.0)
 CAMERA = Camera(LENS, look_at((-2.6, -2.3, 2.25), (0.0, 0.2, 0.55)))
 RATE_HZ = 15.0
@@ -176,7 +179,6 @@ def test_somebody_who_stands_still_has_a_path_too() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(180)
 @pytest.mark.parametrize("seed", [102, 107])
 def test_through_the_real_network_a_rendered_walkers_path_holds_its_bar(seed: int) -> None:
     scenario = make_home(seed, walks=1)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import time
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from effort import effort
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -19,6 +19,9 @@ from vad.sim.render_shapes import View
 from vad.sim.scenario import CameraPlacement, Scenario, make_home
 from vad.vision.ground import GroundPoint, Refusal, ground_point
 from vad.vision.people import MotionGate, Person, PoseNetwork
+
+pytestmark = pytest.mark.timeout(600)
+"""Much work for the processor: a busy machine takes many times as long as an idle one."""
 
 FRAME_S = 0.4
 
@@ -135,12 +138,7 @@ def test_the_motion_gate_opens_for_a_walker_and_rests_in_a_still_room() -> None:
 def test_an_idle_frame_costs_the_gate_little() -> None:
     _, renderer = home(1)
     gate, picture = MotionGate(), renderer.frame(0.0)
-    spent = []
-    for _ in range(30):
-        start = time.process_time()
-        gate.update(picture)
-        spent.append(time.process_time() - start)
-    assert np.median(spent) < 0.005
+    assert effort(*[partial(gate.update, picture)] * 30) < 1
 
 
 # -- ground points of a geometric person -------------------------------------------------------------

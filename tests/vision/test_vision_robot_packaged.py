@@ -17,6 +17,9 @@ from vad.sim.render import Renderer
 from vad.sim.scenario import make_home
 from vad.vision.robot_detector import PACKAGED_MODEL, RobotDetector
 
+pytestmark = pytest.mark.timeout(600)
+"""Much work for the processor: a busy machine takes many times as long as an idle one."""
+
 NOBODY = np.empty((0, 4))
 
 

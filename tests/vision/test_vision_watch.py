@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import time
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+from effort import effort
 from onnx import TensorProto
 from pose_networks import H, W, movenet_multi, red, save
 
@@ -15,6 +15,9 @@ from vad.sim.render import Renderer
 from vad.sim.scenario import Scenario, make_home
 from vad.vision.people import MotionGate, PoseNetwork
 from vad.vision.watch import Look, PeopleWatch
+
+pytestmark = pytest.mark.timeout(600)
+"""Much work for the processor: a busy machine takes many times as long as an idle one."""
 
 FPS = 15
 
@@ -31,15 +34,16 @@ def home(seed: int) -> tuple[Scenario, Renderer]:
 
 
 def watched(watch: PeopleWatch, seed: int, from_s: float, frames: int) -> tuple[list[Look], float]:
-    """What a watch makes of rendered frames, and the CPU seconds it took."""
+    """What a watch makes of rendered frames, and the effort of five of them."""
     _, renderer = home(seed)
-    looks, spent = [], 0.0
-    for k in range(frames):
-        picture = renderer.frame(from_s + k / FPS)
-        begin = time.process_time()
-        looks.append(watch.look(picture, int((from_s + k / FPS) * 1e9)))
-        spent += time.process_time() - begin
-    return looks, spent
+    looks: list[Look] = []
+    pictures = [renderer.frame(from_s + k / FPS) for k in range(frames)]
+
+    def look(first: int) -> None:
+        for k, picture in enumerate(pictures[first : first + 5], first):
+            looks.append(watch.look(picture, int((from_s + k / FPS) * 1e9)))
+
+    return looks, effort(*(partial(look, first) for first in range(0, frames, 5)))
 
 
 def test_a_walker_is_followed_in_every_frame_at_less_than_the_whole_pictures_cost(
@@ -50,11 +54,9 @@ def test_a_walker_is_followed_in_every_frame_at_less_than_the_whole_pictures_cos
     looks, spent = watched(PeopleWatch(network), 2, from_s, 15)
     assert all(look.looked for look in looks)
     assert sum(len(look.people) == 1 for look in looks) >= 14
-    begin = time.process_time()
-    for k in range(5):
-        network.infer(renderer.frame(from_s + k / FPS))
-    whole = (time.process_time() - begin) / 5
-    assert spent / len(looks) < 0.8 * whole
+    pictures = [renderer.frame(from_s + k / FPS) for k in range(5)]
+    whole = effort(*(partial(network.infer, picture) for picture in pictures))
+    assert spent / 5 < 0.8 * whole
 
 
 def test_a_piece_shows_the_same_person_as_the_whole_picture(network: PoseNetwork) -> None:
@@ -87,7 +89,7 @@ def test_a_still_room_costs_next_to_nothing(network: PoseNetwork) -> None:
     watched(watch, 1, scenario.drive_end_s + 0.5, 8)
     looks, spent = watched(watch, 1, scenario.drive_end_s + 1.5, 30)
     assert all(look.looked and not look.people for look in looks)
-    assert spent < 0.08 * 30 / FPS
+    assert spent / 5 < 1
 
 
 def test_who_leaves_the_picture_is_forgotten(network: PoseNetwork) -> None:
