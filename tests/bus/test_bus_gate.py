@@ -14,7 +14,7 @@ from bus_world import STARTED_S
 from security_world import network
 from waiting import free_port, until
 
-from vad.bus import gate as gate_module
+from vad import child
 from vad.bus.access import Holder, access_control
 from vad.bus.gate import Gate, GateSettings, renew_hub
 from vad.pki.certificates import HUB_DAYS, days_left, utc_now
@@ -88,7 +88,7 @@ async def test_who_ends_it_while_its_process_ends_leaves_nothing_behind(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ending = asyncio.Event()
-    gone = gate_module._gone
+    gone = child.gone_with_pipes
 
     async def noted(process: asyncio.subprocess.Process) -> None:
         ending.set()
@@ -97,7 +97,7 @@ async def test_who_ends_it_while_its_process_ends_leaves_nothing_behind(
 
     processes: list[asyncio.subprocess.Process] = []
     async with network(tmp_path, ("viewer", "tablet")) as (world, _):
-        monkeypatch.setattr(gate_module, "_gone", noted)
+        monkeypatch.setattr(child, "gone_with_pipes", noted)
         port = int(world.tls.rpartition(":")[2])
         async with running(gate_for(world.pki.path, world.daemon, port=port)):
             await ending.wait()

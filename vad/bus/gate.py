@@ -23,6 +23,7 @@ import msgspec
 from vad.bus.access import Holder, access_control
 from vad.bus.gate_process import GateOrder, GateReport
 from vad.bus.session import TLS, Values, plain_config
+from vad.child import end_child
 from vad.errors import VadError
 from vad.health import Health
 from vad.pki.certificates import days_left, utc_now
@@ -178,7 +179,7 @@ class Gate:
             return await self._until_changed(process.stdout, detail, seen)
         finally:
             self._connected = []
-            await _end(process)
+            await end_child(process)
 
     async def _opened(self, reports: asyncio.StreamReader, detail: str) -> bool:
         try:
@@ -300,31 +301,6 @@ def renew_hub(folder: PkiFolder, now: datetime) -> str:
     folder.rotate_hub(folder.hub_addresses(), now)
     _log.info("the hub's certificate ended in %.0f days and was renewed", left)
     return ""
-
-
-async def _end(process: asyncio.subprocess.Process) -> None:
-    """Kill it and wait until it is gone with its pipes, also where whoever waits is cancelled meanwhile."""
-    with suppress(ProcessLookupError):
-        process.kill()
-    gone = asyncio.ensure_future(_gone(process))
-    try:
-        await asyncio.shield(gone)
-    except asyncio.CancelledError:
-        await asyncio.wait({gone})
-        raise
-
-
-async def _gone(process: asyncio.subprocess.Process) -> None:
-    """To the last of its pipes: `wait` alone leaves them open where the process had ended by itself."""
-    assert process.stdin is not None
-    assert process.stdout is not None
-    process.stdin.close()
-    with suppress(ConnectionError):
-        while await process.stdout.read(REPORT_BYTES):
-            pass
-    await process.wait()
-    with suppress(ConnectionError):
-        await process.stdin.wait_closed()
 
 
 async def _next(reports: asyncio.StreamReader) -> GateReport | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import AsyncIterator, Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
@@ -74,7 +75,8 @@ class AsyncVadClient:
         """Disconnect; safe to call twice."""
         session, self._session = self._session, None
         if session is not None:
-            await asyncio.to_thread(session.close)
+            with contextlib.suppress(zenoh.ZError):  # it could not say goodbye in time
+                await asyncio.to_thread(session.close)
 
     async def __aenter__(self) -> Self:
         await self.open()

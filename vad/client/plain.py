@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import queue
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -77,7 +78,8 @@ class VadClient:
         """Disconnect; safe to call twice."""
         session, self._session = self._session, None
         if session is not None:
-            session.close()  # type: ignore[no-untyped-call]
+            with contextlib.suppress(zenoh.ZError):  # it could not say goodbye in time
+                session.close()  # type: ignore[no-untyped-call]
 
     def __enter__(self) -> Self:
         self.open()

@@ -7,7 +7,6 @@ solve for a while, so that its memory goes back.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import os
 import pickle
@@ -17,6 +16,7 @@ from pathlib import Path
 
 import msgspec
 
+from vad.child import end_child
 from vad.daemon.solver_child import SolvedWalk, SolveRequest
 from vad.errors import SessionError
 from vad.health import Health
@@ -120,8 +120,5 @@ class Solver:
 
     async def _end(self) -> None:
         process, self._process = self._process, None
-        if process is None:
-            return
-        with contextlib.suppress(ProcessLookupError):
-            process.kill()
-        await process.wait()
+        if process is not None:
+            await end_child(process)

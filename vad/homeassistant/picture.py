@@ -11,7 +11,6 @@ Run as a program it draws one picture and ends.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import io
 import os
 import sys
@@ -21,6 +20,7 @@ from pathlib import Path
 import msgspec
 
 from vad.bus import messages as m
+from vad.child import end_child
 from vad.errors import VadError
 
 NICE = 5
@@ -90,9 +90,7 @@ async def draw(scene: bytes, cache: Path) -> bytes:
     except TimeoutError as error:
         raise VadError("the map's picture takes too long to draw") from error
     finally:
-        with contextlib.suppress(ProcessLookupError):
-            process.kill()
-        await process.wait()
+        await end_child(process)
     if process.returncode != 0 or not png:
         raise VadError("the map's picture cannot be drawn", remedy="The log says more")
     return png

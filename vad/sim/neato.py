@@ -80,10 +80,11 @@ class VirtualNeato:
         if not self._open:
             return
         self._open = False
-        os.close(self._master)
-        os.close(self._slave)
+        # The link first: once the port is closed its number may be given to another program.
         if self._link is not None and self._link.is_symlink() and str(self._link.readlink()) == self._tty:
             self._link.unlink()
+        os.close(self._master)
+        os.close(self._slave)
 
     def reply_to(self, command: str, t_ns: int) -> bytes:
         """The bytes the robot sends for a command line given at `t_ns` of the timeline."""

@@ -98,10 +98,11 @@ class VirtualRoomba:
         if not self._open:
             return
         self._open = False
-        os.close(self._master)
-        os.close(self._slave)
+        # The link first: once the port is closed its number may be given to another program.
         if self._link is not None and self._link.is_symlink() and str(self._link.readlink()) == self._tty:
             self._link.unlink()
+        os.close(self._master)
+        os.close(self._slave)
 
     def _listen(self) -> None:
         with contextlib.suppress(BlockingIOError):
