@@ -113,3 +113,14 @@ async def test_idle_it_gives_its_memory_back(tmp_path: Path) -> None:
         await until(lambda: solver.pid is None, "the process ends")
         with pytest.raises(SessionError, match="no such"):
             await solver.solve(tmp_path / "none")
+
+
+async def test_who_asks_as_the_idle_process_ends_is_answered(tmp_path: Path) -> None:
+    async with solving() as solver:
+        with pytest.raises(SessionError, match="no such"):
+            await solver.solve(tmp_path / "none")
+        solver._let_go()  # it takes a moment until its end is noticed
+        with pytest.raises(SessionError, match="no such"):
+            await solver.solve(tmp_path / "none")
+        assert solver.health.counters["started"] == 2
+        assert solver.health.state == "ok"

@@ -40,6 +40,7 @@ class Solver:
         self._timeout_s = timeout_s
         self._turn = asyncio.Lock()
         self._process: asyncio.subprocess.Process | None = None
+        self._was_let_go = False
         self._retire: asyncio.TimerHandle | None = None
 
     @property
@@ -92,8 +93,9 @@ class Solver:
 
     async def _running(self) -> asyncio.subprocess.Process:
         """The process, a new one where there is none or it has ended."""
-        if self._process is not None and self._process.returncode is None:
+        if self._process is not None and self._process.returncode is None and not self._was_let_go:
             return self._process
+        await self._end()  # one that was let go may still be ending
         self._process = await asyncio.create_subprocess_exec(
             sys.executable,
             "-c",
@@ -116,9 +118,10 @@ class Solver:
         """Idle for long: the process ends; whoever asks next finds it gone."""
         if self._process is not None and self._process.returncode is None:
             self._process.kill()
+            self._was_let_go = True
             self.health.ok("nothing is being solved")
 
     async def _end(self) -> None:
-        process, self._process = self._process, None
+        process, self._process, self._was_let_go = self._process, None, False
         if process is not None:
             await end_child(process)
