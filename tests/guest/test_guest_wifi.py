@@ -12,9 +12,8 @@ from guest_world import Guest
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3000)]
 
-SOON_S = 20.0
-"""Of that ASK_LAST_S is vad's own; a guest's Python is some ten times slower than a hub's, on a host that is
-idle. Without the answer to its question the kernel's source would not tell of a station at all."""
+SOON_S = 2.0
+"""A guest's Python is some ten times slower than a hub's."""
 
 
 @pytest.fixture(scope="module")

@@ -150,7 +150,9 @@ class Questions:
             payload = _single(found, key)
             if payload is None:
                 raise ProtocolError(
-                    "this daemon takes no wishes", where=key, remedy="Bring vad up to date there"
+                    "this daemon takes no wishes",
+                    where=key,
+                    remedy="If it is still starting (`vad status`), ask again; else bring vad up to date there",
                 )
             return decoded(payload, m.WishReply, key)
 
