@@ -152,7 +152,7 @@ class Questions:
                 raise ProtocolError(
                     "this daemon takes no wishes",
                     where=key,
-                    remedy="If it is still starting (`vad status`), ask again; else bring vad up to date there",
+                    remedy="If it is still starting, ask again; else bring vad up to date there",
                 )
             return decoded(payload, m.WishReply, key)
 
