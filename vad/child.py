@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 from contextlib import suppress
 
+from vad.finish import finished
+
 _READ_BYTES = 65_536
 
 
@@ -12,12 +14,7 @@ async def end_child(process: asyncio.subprocess.Process) -> None:
     """Kill it and wait until it is gone with its pipes, also where whoever waits is cancelled meanwhile."""
     with suppress(ProcessLookupError):
         process.kill()
-    gone = asyncio.ensure_future(gone_with_pipes(process))
-    try:
-        await asyncio.shield(gone)
-    except asyncio.CancelledError:
-        await asyncio.wait({gone})
-        raise
+    await finished(asyncio.ensure_future(gone_with_pipes(process)))
 
 
 async def gone_with_pipes(process: asyncio.subprocess.Process) -> None:

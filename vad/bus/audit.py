@@ -21,13 +21,12 @@ _THREAD = re.compile(r"\bThreadId\((\d+)\)")
 _CACHING = re.compile(r"access_control: ACL \(ingress\): caching permissions for `(?P<key>.*)` \.\.\.$")
 _DENIED = re.compile(
     r"access_control: (?P<cached>Using cached result: )?(?P<zid>[0-9a-f]+)"
-    r"(?: on (?P<subject>[^ ]+))? is unauthorized to (?P<what>[A-Za-z/ ]+) \(ingress\)(?: on (?P<key>.*))?$"
+    r"(?: on [^ ]+)? is unauthorized to (?P<what>[A-Za-z/ ]+) \(ingress\)(?: on (?P<key>.*))?$"
 )
 _VERDICT = re.compile(
     r"access_control: [0-9a-f]+ on \S+ is (?:un)?authorized to [A-Za-z/ ]+ \(ingress\) on (.*)$"
 )
 _WHO = re.compile(r"([0-9a-f]+) on \S*CertCommonName\(([^)]*)\)")
-_COMMON_NAME = re.compile(r"CertCommonName\(([^)]*)\)")
 _REFUSED = re.compile(r"\bWARN\b.*zenoh_link_tls::\w+: (?P<reason>.*?)(?:\. Hint: .*)?$")
 
 _REASONS = (
@@ -107,6 +106,5 @@ class AuditReader:
             self._working_out.pop(thread, None)
         if denied is None:
             return None
-        name = _COMMON_NAME.search(denied["subject"] or "")
-        common_name = name[1] if name else self._names.get(denied["zid"], "")
+        common_name = self._names.get(denied["zid"], "")
         return Denied(denied["zid"], common_name, denied["what"].strip(), denied["key"] or "")

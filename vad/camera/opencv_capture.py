@@ -26,14 +26,9 @@ class Capture(Protocol):
 
 
 class Grabber:
-    """Takes pictures from an opened capture. where: the camera's, for what it raises.
-
-    Attributes:
-        bad: pictures that could not be decoded.
-    """
+    """Takes pictures from an opened capture. where: the camera's, for what it raises."""
 
     def __init__(self, capture: Capture, where: str) -> None:
-        self.bad = 0
         self._bad_in_a_row = 0
         self._capture = capture
         self._where = where
@@ -50,17 +45,17 @@ class Grabber:
             raise SourceError("the camera has stopped sending", where=self._where)
         return arrival_ns
 
-    def decode(self) -> NDArray[np.uint8] | None:
-        """The picture that was grabbed, (height, width, 3) BGR; None where it is damaged.
+    def decode(self) -> tuple[NDArray[np.uint8], int] | None:
+        """The picture that was grabbed, (height, width, 3) BGR, and how many damaged ones came right before
+        it; None where it is damaged itself.
 
         Raises:
             SourceError: that was so for the last BAD_IN_A_ROW.
         """
         good, image = self._capture.retrieve()
         if good and image is not None and image.size:
-            self._bad_in_a_row = 0
-            return np.asarray(image, dtype=np.uint8)
-        self.bad += 1
+            bad, self._bad_in_a_row = self._bad_in_a_row, 0
+            return np.asarray(image, dtype=np.uint8), bad
         self._bad_in_a_row += 1
         if self._bad_in_a_row >= BAD_IN_A_ROW:
             remedy = "choose another pixel format, or look at its cable and its network"

@@ -74,7 +74,7 @@ class RtspCamera:
     def _session(self, stop: threading.Event, emit: Emit, wants: Wants) -> None:
         capture = self._opener(self._url, self._transport)
         clock, restarts = ClockMap(), 0
-        grabber, bad = Grabber(capture, self._where), 0
+        grabber = Grabber(capture, self._where)
         try:
             if not capture.isOpened():
                 remedy = "see whether it is on, and whether the path, user and password are right"
@@ -87,17 +87,18 @@ class RtspCamera:
                 t_ns = min(t_ns, arrival_ns)
                 if not wants(t_ns):
                     continue
-                picture = grabber.decode()
-                if picture is None:
+                decoded = grabber.decode()
+                if decoded is None:
                     continue
+                picture, bad = decoded
                 height, width = picture.shape[:2]
                 stamps = "arrival" if clock.still else "stream"
                 counts = {
                     "arrival_stamps": int(clock.still),
                     "clock_restarts": clock.restarts - restarts,
-                    BAD_PICTURES: grabber.bad - bad,
+                    BAD_PICTURES: bad,
                 }
-                restarts, bad = clock.restarts, grabber.bad
+                restarts = clock.restarts
                 emit(Shot(t_ns, picture, f"{width}x{height}, stamps: {stamps}", counts))
         finally:
             capture.release()

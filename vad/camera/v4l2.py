@@ -79,7 +79,7 @@ class V4l2Camera:
             capture.set(cv2.CAP_PROP_FRAME_HEIGHT, wanted.height_px)
             capture.set(cv2.CAP_PROP_FPS, wanted.fps)
             fourcc, stamps, last_ns = _format(capture), _DriverClock(), 0
-            grabber, bad = Grabber(capture, wanted.device), 0
+            grabber = Grabber(capture, wanted.device)
             while not stop.is_set():
                 arrival_ns = grabber.grab()
                 driver_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
@@ -89,20 +89,13 @@ class V4l2Camera:
                 last_ns = t_ns
                 if not wants(t_ns):
                     continue
-                picture = grabber.decode()
-                if picture is None:
+                decoded = grabber.decode()
+                if decoded is None:
                     continue
+                picture, bad = decoded
                 height, width = picture.shape[:2]
                 detail = f"{width}x{height} {fourcc}, stamps: {'driver' if trusted else 'arrival'}"
-                emit(
-                    Shot(
-                        t_ns,
-                        picture,
-                        detail,
-                        {"arrival_stamps": not trusted, BAD_PICTURES: grabber.bad - bad},
-                    )
-                )
-                bad = grabber.bad
+                emit(Shot(t_ns, picture, detail, {"arrival_stamps": not trusted, BAD_PICTURES: bad}))
         finally:
             capture.release()
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 from collections.abc import AsyncIterator, Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
@@ -75,7 +74,7 @@ class AsyncVadClient:
         """Disconnect; safe to call twice."""
         session, self._session = self._session, None
         if session is not None:
-            with contextlib.suppress(zenoh.ZError):  # it could not say goodbye in time
+            with suppress(zenoh.ZError):  # it could not say goodbye in time
                 await asyncio.to_thread(session.close)
 
     async def __aenter__(self) -> Self:

@@ -27,8 +27,8 @@ from vad.csi.follow import FollowLog
 from vad.csi.logfile import read_log
 from vad.csi.packets import CsiBatch, CsiPackets, CsiSource
 from vad.csi.summary import summarise
-from vad.daemon.threads import to_the_end
 from vad.errors import VadError
+from vad.finish import to_the_end
 from vad.report.csi import log_table, recording_line
 from vad.streams import DropOldestQueue
 

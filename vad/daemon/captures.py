@@ -35,10 +35,10 @@ from vad.daemon.eyes import Eyes
 from vad.daemon.measuring import Hearing, Measuring
 from vad.daemon.registry import Registry
 from vad.daemon.solver import Solver
-from vad.daemon.threads import to_the_end
 from vad.daemon.traffic import Traffic
 from vad.daemon.walk import Recorded, WalkRecorder
 from vad.errors import SessionError
+from vad.finish import to_the_end
 from vad.health import Health
 from vad.robot.floor_plan import FloorPlan
 from vad.store.records import DeviceRecord

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import msgspec
 
-from vad.daemon.threads import to_the_end
+from vad.finish import to_the_end
 from vad.health import Health
 from vad.wall import now_rfc3339
 

@@ -11,7 +11,7 @@ import numpy as np
 from vad.capture.walk_writer import WalkWriter
 from vad.csi.heard import HeardStations
 from vad.csi.packets import CsiBatch
-from vad.daemon.threads import to_the_end
+from vad.finish import to_the_end
 from vad.mac import UNKNOWN_MAC, mac_from_text
 from vad.streams import DropOldestQueue
 

@@ -27,8 +27,8 @@ from vad.daemon.eyes import Eyes
 from vad.daemon.findings import DeviceGoneError, Findings
 from vad.daemon.registry import Registry
 from vad.daemon.solver import Solver
-from vad.daemon.threads import to_the_end
 from vad.errors import SessionError
+from vad.finish import to_the_end
 from vad.mapping.walk import WalkTrack
 
 _log = logging.getLogger(__name__)

@@ -9,11 +9,11 @@ import asyncio
 import contextlib
 import math
 import os
-import pty
 import time
-import tty
 from collections.abc import Callable, Sequence
 from pathlib import Path
+
+from vad.sim.port import VirtualPort
 
 Pose = tuple[float, float, float]
 """x_m, y_m, yaw_rad in the robot's map."""
@@ -45,46 +45,30 @@ class VirtualNeato:
         self._pose_at = pose_at
         self._scan_at = scan_at
         self._latency_s = latency_s
-        self._link = link
-        self._master, self._slave = pty.openpty()
-        # Our own descriptor of the slave keeps the line up while clients come and go.
-        tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
-        self._tty = os.ttyname(self._slave)
-        self._open = True
+        self._port = VirtualPort(link)
         self._commands: asyncio.Queue[str] = asyncio.Queue()
         self._line = bytearray()
         self.answered = 0
-        if link is not None:
-            link.unlink(missing_ok=True)
-            link.symlink_to(self._tty)
 
     @property
     def path(self) -> str:
         """What a client opens."""
-        return self._tty if self._link is None else str(self._link)
+        return self._port.path
 
     async def run(self) -> None:
         """Answer commands until cancelled; then the port disappears, as when it is unplugged."""
         loop = asyncio.get_running_loop()
-        loop.add_reader(self._master, self._readable)
+        loop.add_reader(self._port.master, self._readable)
         try:
             while True:
                 await self._answer(await self._commands.get())
         finally:
-            loop.remove_reader(self._master)
+            loop.remove_reader(self._port.master)
             self.close()
 
     def close(self) -> None:
         """Unplug the port; a second time does nothing."""
-        if not self._open:
-            return
-        self._open = False
-        # The link first: once the port is closed its number may be given to another program.
-        if self._link is not None and self._link.is_symlink() and str(self._link.readlink()) == self._tty:
-            self._link.unlink()
-        os.close(self._master)
-        os.close(self._slave)
+        self._port.close()
 
     def reply_to(self, command: str, t_ns: int) -> bytes:
         """The bytes the robot sends for a command line given at `t_ns` of the timeline."""
@@ -103,7 +87,7 @@ class VirtualNeato:
 
     def _readable(self) -> None:
         try:
-            data = os.read(self._master, 4096)
+            data = os.read(self._port.master, 4096)
         except BlockingIOError:
             return
         for byte in data:
@@ -119,7 +103,7 @@ class VirtualNeato:
         await asyncio.sleep(self._latency_s / 2)
         # A serial line has no flow control: what nobody reads is lost.
         with contextlib.suppress(BlockingIOError):
-            os.write(self._master, reply)
+            os.write(self._port.master, reply)
         self.answered += 1
 
 

@@ -8,12 +8,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
-import pty
 import struct
-import tty
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+
+from vad.sim.port import VirtualPort
 
 PERIOD_S = 0.015
 
@@ -56,23 +56,14 @@ class VirtualRoomba:
     ) -> None:
         self.body = body
         self._line = line
-        self._link = link
-        self._master, self._slave = pty.openpty()
-        # Our own descriptor of the slave keeps the line up while clients come and go.
-        tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
-        self._tty = os.ttyname(self._slave)
-        self._open = True
+        self._port = VirtualPort(link)
         self._heard = bytearray()
         self._wanted: bytes = b""
-        if link is not None:
-            link.unlink(missing_ok=True)
-            link.symlink_to(self._tty)
 
     @property
     def path(self) -> str:
         """What a client opens."""
-        return self._tty if self._link is None else str(self._link)
+        return self._port.path
 
     async def run(self) -> None:
         """Stream what was asked for until cancelled; then the port disappears, as when it is unplugged."""
@@ -82,7 +73,7 @@ class VirtualRoomba:
                 if self._wanted:
                     # A serial line has no flow control: what nobody reads is lost.
                     with contextlib.suppress(BlockingIOError):
-                        os.write(self._master, self._line(self.frame()))
+                        os.write(self._port.master, self._line(self.frame()))
                 await asyncio.sleep(PERIOD_S)
         finally:
             self.close()
@@ -95,18 +86,11 @@ class VirtualRoomba:
 
     def close(self) -> None:
         """Unplug the port; a second time does nothing."""
-        if not self._open:
-            return
-        self._open = False
-        # The link first: once the port is closed its number may be given to another program.
-        if self._link is not None and self._link.is_symlink() and str(self._link.readlink()) == self._tty:
-            self._link.unlink()
-        os.close(self._master)
-        os.close(self._slave)
+        self._port.close()
 
     def _listen(self) -> None:
         with contextlib.suppress(BlockingIOError):
-            self._heard += os.read(self._master, 4096)
+            self._heard += os.read(self._port.master, 4096)
         # Nothing is understood before Start.
         begin = self._heard.find(_START)
         del self._heard[: begin if begin >= 0 else len(self._heard)]
