@@ -32,9 +32,6 @@ from vad.pki.certificates import CLIENT_DAYS, utc_now
 from vad.pki.credentials import write_credentials
 from vad.pki.folder import PkiFolder
 
-pytestmark = pytest.mark.timeout(300)
-"""Processes are started, and waited for one after the other: a busy machine takes its time for each."""
-
 
 @contextlib.asynccontextmanager
 async def gate(folder: Path, port: int, tls: str, *names: str) -> AsyncIterator[list[Path]]:

@@ -20,9 +20,6 @@ from vad.bus.gate import Gate, GateSettings, renew_hub
 from vad.pki.certificates import HUB_DAYS, days_left, utc_now
 from vad.pki.folder import PkiFolder
 
-pytestmark = pytest.mark.timeout(300)
-"""Processes are started, and waited for one after the other: a busy machine takes its time for each."""
-
 
 @asynccontextmanager
 async def running(gate: Gate) -> AsyncIterator[Gate]:

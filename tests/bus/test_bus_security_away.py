@@ -22,9 +22,6 @@ from vad.pki.certificates import Role, utc_now
 from vad.pki.credentials import write_credentials
 from vad.pki.folder import PkiFolder
 
-pytestmark = pytest.mark.timeout(300)
-"""Processes are started, and waited for one after the other: a busy machine takes its time for each."""
-
 DAEMON = """
 import asyncio, sys
 from pathlib import Path

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,15 +11,12 @@ import pytest
 import zenoh
 from bus_world import PATIENCE_S
 from security_world import Network, answer, ask, gate_pid, memory_kib, network, on
-from waiting import until
+from waiting import until, wait_until
 
 from vad.bus.gate import TOLD_EACH
 from vad.client import VadClient
 from vad.errors import VadError
 from vad.pki.certificates import Role
-
-pytestmark = pytest.mark.timeout(300)
-"""Processes are started, and waited for one after the other: a busy machine takes its time for each."""
 
 MAC = "aa:bb:cc:dd:ee:01"
 TABLE = f"""
@@ -105,7 +101,7 @@ def try_everything(hub: Hub, connect: Callable[[], zenoh.Session]) -> Cells:
     def settled(session: zenoh.Session = client) -> None:
         assert ask(session, SENTINEL), "the link works"
 
-    wait_for(lambda: bool(ask(client, SENTINEL)), "the way from the client to the hub")
+    wait_until(lambda: ask(client, SENTINEL), "the way from the client to the hub", PATIENCE_S)
     for key in KEYS:
         cells[key, "query"] = b"hub" in ask(client, key)
         found = client.liveliness().get(key, timeout=PATIENCE_S)
@@ -151,13 +147,6 @@ def try_everything(hub: Hub, connect: Callable[[], zenoh.Session]) -> Cells:
 
 def collect(into: list[str]) -> Callable[[zenoh.Sample], None]:
     return lambda sample: into.append(str(sample.key_expr))
-
-
-def wait_for(condition: Callable[[], bool], what: str) -> None:
-    until_s = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < until_s, what
-        time.sleep(0.005)
 
 
 @pytest.mark.parametrize("role", ROLES)

@@ -23,9 +23,6 @@ from vad.pki.certificates import ends_at, utc_now
 from vad.pki.credentials import ENVIRONMENT, write_credentials
 from vad.pki.folder import PkiFolder
 
-pytestmark = pytest.mark.timeout(300)
-"""Processes are started, and waited for one after the other: a busy machine takes its time for each."""
-
 DAY_S = 86_400
 
 

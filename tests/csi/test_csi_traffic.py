@@ -12,13 +12,12 @@ import shutil
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import AsyncIterator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from waiting import until
+from waiting import until, wait_until
 
 from vad.csi.traffic import EchoTraffic
 from vad.errors import VadError
@@ -79,17 +78,14 @@ def own_network() -> Iterator[None]:
             assert libc.setns(before.fileno(), _CLONE_NEWNET) == 0, os.strerror(ctypes.get_errno())
 
 
-def wait_until_it_carries(address: str) -> None:
-    """Until packets go there and back: the kernel turns a new cable's queues on when it has time, and asks a
-    second later for the hardware address of a device whose answer was dropped before that."""
-    until_s = time.monotonic() + 40.0
-    while time.monotonic() < until_s:
-        with socket.socket() as probe:
-            probe.settimeout(1.0)
-            with contextlib.suppress(OSError):
-                if probe.connect_ex((address, 9)) == errno.ECONNREFUSED:
-                    return
-    raise AssertionError(f"the cable to {address} does not carry")
+def carries(address: str) -> bool:
+    """Whether packets go there and back."""
+    with socket.socket() as probe:
+        probe.settimeout(1.0)
+        try:
+            return probe.connect_ex((address, 9)) == errno.ECONNREFUSED
+        except OSError:
+            return False
 
 
 @pytest.fixture
@@ -112,7 +108,9 @@ def peer() -> Iterator[Peer]:
             ip("link", "set", made.interface, "up")
             ip("-n", made.namespace, "addr", "add", f"{made.address}/24", "dev", "eth0")
             ip("-n", made.namespace, "link", "set", "eth0", "up")
-            wait_until_it_carries(made.address)
+            # The kernel turns a new cable's queues on when it has time, and asks a second later for the
+            # hardware address of a device whose answer was dropped before that.
+            wait_until(lambda: carries(made.address), f"the cable to {made.address} carries")
             yield made
         finally:
             ip("netns", "del", made.namespace)

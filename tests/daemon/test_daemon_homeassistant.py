@@ -83,7 +83,6 @@ def _ignore(vad: Vad, port: int, mac: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_a_broker_that_is_not_there_is_trouble_and_no_more(tmp_path: Path) -> None:
     port = free_port()
     folder = tmp_path / "home"

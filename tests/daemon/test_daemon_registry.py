@@ -338,7 +338,6 @@ async def test_a_device_is_renamed_and_forgotten(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 async def test_several_thousand_passers_by_leave_the_home_as_it_was(tmp_path: Path) -> None:
     async with hub(tmp_path) as home:
         registry = home.registry

@@ -20,8 +20,6 @@ from vad.sim.scenario import make_home
 
 HOME = make_home(1, walks=1)
 
-pytestmark = pytest.mark.timeout(300)
-
 
 @asynccontextmanager
 async def solving(**arguments: float) -> AsyncIterator[Solver]:

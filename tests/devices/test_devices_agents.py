@@ -7,6 +7,7 @@ import contextlib
 from collections.abc import AsyncIterator, Iterator
 
 import pytest
+import source_world
 import zenoh
 from waiting import free_port, until
 
@@ -74,14 +75,8 @@ async def node(endpoint: str, agent: str, answer: bytes | None) -> AsyncIterator
 @contextlib.asynccontextmanager
 async def running(router: zenoh.Session, out: Events) -> AsyncIterator[AgentSource]:
     source = AgentSource(router, KEYS.agent_alive(), said)
-    task = asyncio.create_task(source.run(out))
-    try:
+    async with source_world.running(source, out):
         yield source
-    finally:
-        assert not task.done(), task
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
 
 
 async def take(out: Events) -> tuple[str, str, str | None, str | None, str]:

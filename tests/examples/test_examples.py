@@ -21,9 +21,6 @@ from vad.bus.schemas import json_schemas
 from vad.bus.session import BusSettings
 from vad.client import VadClient
 
-pytestmark = pytest.mark.timeout(300)
-"""Processes are started, and waited for one after the other: a busy machine takes its time for each."""
-
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "tools" / "examples"
 TYPESCRIPT = (EXAMPLES / "typescript" / "devices.ts").read_text(encoding="utf-8")

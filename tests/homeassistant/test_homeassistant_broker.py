@@ -26,7 +26,7 @@ LAMP, PHONE = "f4:f5:d8:d3:35:b2", "3a:11:22:33:44:55"
 DRAWN_S = 320.0
 """Drawing gives way to all else on a machine."""
 
-pytestmark = [needs_mosquitto, pytest.mark.timeout(300)]
+pytestmark = needs_mosquitto
 
 
 @pytest.fixture(autouse=True)
